@@ -309,7 +309,7 @@ class _Traffic:
         await self._far.close()
 
     def _change(self, conditions: Conditions | None) -> float | None:
-        """Put other conditions into force, unless there are none; when a program first requested the table."""
+        """Put other conditions into force, if any; when a program first requested the table."""
         old, requested_at = self._air, self._vehicle.first_request_at
         if conditions is not None:
             self._leaving.append((old.uplink, self._vehicle.outgoing.append))
