@@ -13,8 +13,6 @@ import anyio
 
 from paramclient.sim import Endpoint
 
-__all__ = ["Cable"]
-
 TIMEOUT = 120.0
 """Seconds after which a test fails; a passing test never waits that long."""
 

@@ -10,8 +10,6 @@ from paramclient.model.values import Encoding, ParamType, Value, encode_value
 from paramclient.sim import Endpoint
 from paramclient.wire import frames, messages
 
-__all__ = ["LIST", "PERIODIC_MESSAGES", "SMALL", "Station", "cast", "indices", "names", "read", "write"]
-
 SMALL: dict[str, Value | tuple[ParamType | int, Value]] = {
     "A_FLOAT": 1.5,
     "B_INT": 7,

@@ -23,8 +23,6 @@ from paramclient.wire.frames import Frame
 from paramclient.wire.messages import Message
 from tests.shell import clamped
 
-__all__ = ["BROWSER", "BROWSER_OPTIONS", "HIGHEST", "HOSTILE", "Bench", "at_work"]
-
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 """Where a browser is, or None."""
 BROWSER_OPTIONS = [

@@ -16,8 +16,6 @@ from pathlib import Path
 from urllib.parse import quote
 from uuid import uuid4
 
-__all__ = ["GIVEN", "PROGRAMS", "Server", "WHY_NONE", "database_on", "server"]
-
 GIVEN = os.environ.get("PARAMCLIENT_TEST_POSTGRES")
 """URL of a database in which the tests may make databases of their own; they do not end this server."""
 
@@ -102,19 +100,14 @@ class Server:
             start_new_session=True,
         )
 
-    def stand_still(self) -> None:
-        """Have it answer nothing, and keep its connections."""
-        self._send_all(signal.SIGSTOP)
-
-    def go_on(self) -> None:
-        """Have it go on after `stand_still`."""
-        self._send_all(signal.SIGCONT)
-
     def kill(self) -> None:
         """End it as a power cut does: its first process and all that this has started."""
         assert self._process is not None
         self._process.send_signal(signal.SIGSTOP)  # so that it starts no other one meanwhile
-        self._send_all(signal.SIGKILL)
+        pid = self._process.pid
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        for each in (*map(int, children), pid):
+            os.kill(each, signal.SIGKILL)
         self._process.wait()
         self._process = None
 
@@ -124,13 +117,6 @@ class Server:
             self._process.send_signal(signal.SIGQUIT)
             self._process.wait()
             self._process = None
-
-    def _send_all(self, number: signal.Signals) -> None:
-        assert self._process is not None
-        pid = self._process.pid
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-        for each in (*map(int, children), pid):
-            os.kill(each, number)
 
     def _run(self, program: str, *arguments: str) -> None:
         subprocess.run(

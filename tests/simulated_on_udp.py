@@ -15,8 +15,6 @@ from paramclient.links import create_link, serve_endpoint
 from paramclient.links.sockets import UdpIn
 from paramclient.sim import Endpoint
 
-__all__ = ["flying"]
-
 
 @contextmanager
 def flying(endpoint: Endpoint) -> Iterator[str]:

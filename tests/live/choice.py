@@ -14,8 +14,6 @@ from typing import Final
 
 from paramclient.model.values import Param, ParamType, bits_of, from_bits
 
-__all__ = ["MANY", "Choice", "another_value", "choose"]
-
 MANY: Final = 30
 """Parameters that the check of many sets changes, where the vehicle has as many harmless ones."""
 FIRST_SPARE_CHANNEL: Final = 9

@@ -18,8 +18,6 @@ from paramclient.model.values import Param, Value, format_value
 from paramclient.protocol.set_results import SetResult
 from paramclient.provision.apply_rules import rules_for
 
-__all__ = ["Journal", "check_disarmed"]
-
 HEARTBEAT_TIMEOUT: Final = 3.0
 """Seconds to wait for a heartbeat that says whether the vehicle is armed."""
 PUT_BACK_ATTEMPTS: Final = 4

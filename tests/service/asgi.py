@@ -11,8 +11,6 @@ import anyio
 import httpx
 from starlette.types import ASGIApp, Message, Scope
 
-__all__ = ["a_browser"]
-
 MESSAGES_MAX: Final = 64
 """Messages that an application may have sent, and no client has read, before `send` waits."""
 
