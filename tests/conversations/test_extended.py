@@ -13,11 +13,11 @@ from paramclient.model.values import Value
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
-from paramclient.protocol.set_results import SetResult, SetStatus
+from paramclient.protocol.set_results import SetStatus
 from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, Camera, Endpoint, PX4Vehicle
 from paramclient.wire import messages
-from tests.conversations.virtual import Conversation, Silence, Tap, converse, virtual_on_both
+from tests.conversations.virtual import Conversation, Silence, Tap, converse, meanwhile, virtual_on_both
 
 CAMERA = (1, 100)
 
@@ -134,13 +134,7 @@ async def test_a_change_by_another_station_is_seen_by_its_acknowledgement() -> N
 async def test_the_refusal_of_another_stations_set_is_not_taken_for_ours() -> None:
     async with filming(Air.symmetric([Camera()], delay=0.05)) as (conversation, session):
         await fetch_all(session)
-        results: list[SetResult] = []
-
-        async def set_mode() -> None:
-            results.append(await write(session, "CAM_MODE", 2))
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(set_mode)
+        async with meanwhile(write(session, "CAM_MODE", 2)) as results:
             await anyio.sleep(0.02)
             refusal = messages.ParamExtAck("CAM_MODE", bytes(128), 5, errors.ExtAckResult.VALUE_UNSUPPORTED)
             conversation.hear(refusal, component=100)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Coroutine
-from contextlib import suppress
+from collections.abc import Awaitable
 from random import Random
 from typing import Any, TypeAlias
 
@@ -39,7 +38,7 @@ from paramclient.wire.messages import (
     encode,
 )
 from tests.conversations.partial import Partial
-from tests.conversations.virtual import Puppet, converse, jump, talking, virtual_on_both
+from tests.conversations.virtual import Puppet, converse, jump, meanwhile, talking, virtual, virtual_on_both
 
 Faults: TypeAlias = dict[str, Any]
 
@@ -157,35 +156,26 @@ any_message = st.one_of(
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(any_message, max_size=60), st.lists(st.binary(max_size=60), max_size=5))
+@virtual
 async def test_no_message_and_no_bytes_raise_whatever_is_in_progress(
     messages: list[Message], noise: list[bytes]
 ) -> None:
     async with converse(PX4Vehicle(table={"A": 1, "B": 2.5})) as conversation:
         node = await conversation.node()
-        calls = (
-            (fetch_all, node.plain),
-            (fetch_all, node.extended),
-            (write, node.plain, "A", 5),
-            (read, node.plain, "B"),
-        )
-
-        async def ended(call: tuple[object, ...]) -> None:
-            function, *arguments = call
-            with suppress(ParamClientError), anyio.move_on_after(3.0):
-                await function(*arguments)  # type: ignore[operator]  # one of the calls
-
-        async with anyio.create_task_group() as tasks:
-            for call in calls:
-                tasks.start_soon(ended, call)
+        calls: list[Awaitable[object]] = [fetch_all(node.plain), fetch_all(node.extended)]
+        calls += [write(node.plain, "A", 5), read(node.plain, "B")]
+        async with meanwhile(*calls) as ends:
             for message in messages:
                 conversation.hear(message)
                 await anyio.sleep(0.003)
             for data in noise:
                 conversation.station.receive(data, "sim", anyio.current_time())
+        assert all(isinstance(each, ParamClientError) for each in ends if isinstance(each, Exception))
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.binary(max_size=200), max_size=8), st.booleans())
+@virtual
 async def test_any_bytes_are_taken_by_a_station(chunks: list[bytes], is_stream: bool) -> None:
     station = Station(link="x", is_stream=is_stream, send=lambda data, peer: None, spawn=lambda *work: None)
     frame = encode(Heartbeat(2, 12), system=1, component=1, sequence=0)
@@ -230,18 +220,17 @@ async def test_calls_go_on_after_the_computer_was_suspended(kind: str, at: float
     async with converse(Air.symmetric([vehicle], delay=0.02)) as conversation:
         node = await conversation.node()
         await node.identification.settled()
-        calls: list[Callable[[], Coroutine[object, object, object]]] = [
-            lambda: fetch_all(node.plain, refresh=True),
-            lambda: read(node.plain, vehicle.listed[1].name),
-            lambda: write(node.plain, vehicle.listed[2].name, 1),
-        ]
-        for call in calls:
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(call)
+        for call in (
+            fetch_all(node.plain, refresh=True),
+            read(node.plain, vehicle.listed[1].name),
+            write(node.plain, vehicle.listed[2].name, 1),
+        ):
+            async with meanwhile(call) as ends:
                 await anyio.sleep(at)
                 jump(60.0)
                 resumed_at = anyio.current_time()
             assert anyio.current_time() - resumed_at < 3.0
+            assert not isinstance(ends[0], Exception)
             await anyio.sleep(3.0)
         assert not node.presence.is_lost
         assert not node.channel.inboxes

@@ -14,7 +14,7 @@ from paramclient.model.values import ParamType, Trust
 from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle, px4_table
 from paramclient.wire import messages
-from tests.conversations.virtual import Silence, Tap, converse, run, talking, virtual_on_both
+from tests.conversations.virtual import Silence, Tap, converse, meanwhile, run, talking, virtual_on_both
 
 BACKENDS = pytest.mark.parametrize("backend", ["trio", "asyncio"])
 
@@ -107,17 +107,9 @@ async def test_a_value_changed_meanwhile_is_downloaded() -> None:
 async def test_fetches_at_once_share_one_and_a_cancelled_caller_ends_only_its_own() -> None:
     vehicle = PX4Vehicle()
     async with talking(Air.symmetric([vehicle], delay=0.05)) as (_, session):
-        results: list[FetchResult] = []
-
-        async def fetch(after: float, limit: float) -> None:
-            await anyio.sleep(after)
-            with anyio.move_on_after(limit):
-                results.append(await fetch_all(session))
-
-        async with anyio.create_task_group() as tasks:
-            for after, limit in ((0.0, 0.3), (0.1, 60.0), (0.2, 60.0)):
-                tasks.start_soon(fetch, after, limit)
-        assert len(results) == 2
+        async with meanwhile(fetch_all(session), fetch_all(session)) as results:
+            with anyio.move_on_after(0.3):
+                await fetch_all(session)
         assert results[0] is results[1]
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
 
@@ -127,16 +119,10 @@ async def test_a_refresh_downloads_also_where_the_hash_is_being_asked() -> None:
     vehicle = PX4Vehicle()
     async with talking(Air.symmetric([vehicle], delay=0.05)) as (_, session):
         await fetch_all(session)
-        sources: dict[bool, str] = {}
-
-        async def fetch(refresh: bool) -> None:
-            sources[refresh] = (await fetch_all(session, refresh=refresh)).source
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(fetch, False)
+        async with meanwhile(fetch_all(session)) as results:
             await anyio.sleep(0.02)
-            tasks.start_soon(fetch, True)
-        assert sources == {False: "cache", True: "stream"}
+            results.append(await fetch_all(session, refresh=True))
+        assert {each.source for each in results} == {"cache", "stream"}
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 2
 
 

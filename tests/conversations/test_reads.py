@@ -10,13 +10,12 @@ import pytest
 
 from paramclient.errors import LinkError, NoReply, ParamErrorCode, Refused, UnknownParameter
 from paramclient.model.values import ParamType, Trust
-from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read, read_many
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire.messages import Message, ParamError, ParamRequestRead, ParamValue
-from tests.conversations.virtual import Puppet, Silence, Tap, converse, talking, virtual_on_both
+from tests.conversations.virtual import Puppet, Silence, Tap, converse, meanwhile, talking, virtual_on_both
 
 TABLE = {"RTL_ALT": 1500, "MC_ROLL_P": 6.5, "MC_PITCH_P": 6.5}
 MAKERS = {
@@ -101,21 +100,13 @@ async def test_on_a_clean_link_few_reads_are_repeated_to_ardupilot(delay: float)
 
 async def test_one_value_answers_both_a_read_by_name_and_one_by_index_and_others_none() -> None:
     async with talking(GenericVehicle(TABLE, dead=range(3))) as (conversation, session):
-        got: list[str | int] = []
-
-        async def ask(which: str | int) -> None:
-            await read(session, which)
-            got.append(which)
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(ask, "MC_ROLL_P")
-            tasks.start_soon(ask, 1)
+        async with meanwhile(read(session, "MC_ROLL_P"), read(session, 1)) as got:
             await anyio.sleep(0.1)
             conversation.hear(ParamValue("MC_PITCH_P", bytes(4), 9, 3, 2))
             await anyio.sleep(0.01)
             assert not got
             conversation.hear(ParamValue("MC_ROLL_P", bytes(4), 9, 3, 1))
-        assert set(got) == {"MC_ROLL_P", 1}
+        assert [(each.param_id, each.param_index) for each in got] == [("MC_ROLL_P", 1)] * 2
 
 
 @pytest.mark.parametrize("which", ["A", 7])
@@ -160,41 +151,26 @@ async def test_an_ardupilot_takes_names_in_any_case_and_its_table_has_one_of_eac
 @virtual_on_both
 async def test_reads_wait_while_the_link_is_down_and_end_when_it_fails() -> None:
     vehicle = PX4Vehicle()
-    async with converse(vehicle) as conversation:
-        session, station = (await conversation.node()).plain, conversation.station
+    async with talking(vehicle) as (conversation, session):
+        station = conversation.station
         await anyio.sleep(0.5)
-        ends: list[float] = []
-
-        async def ask() -> None:
-            await read(session, "MC_ROLL_P")
-            ends.append(anyio.current_time())
-
-        async with anyio.create_task_group() as tasks:
+        async with meanwhile(read(session, "MC_ROLL_P")):
             station.interrupt()
             asked = vehicle.requests["PARAM_REQUEST_READ"]
-            tasks.start_soon(ask)
             await anyio.sleep(30.0)
             assert vehicle.requests["PARAM_REQUEST_READ"] == asked
-            station.resume(anyio.current_time())
-        assert ends[0] - 30.5 < 0.1
+            station.resume(resumed_at := anyio.current_time())
+        assert anyio.current_time() - resumed_at < 0.1
         station.interrupt()
-        raised: list[LinkError] = []
-
-        async def fail() -> None:
-            with pytest.raises(LinkError) as caught:
-                await read(session, "MC_ROLL_P")
-            raised.append(caught.value)
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(fail)
+        async with meanwhile(read(session, "MC_ROLL_P")) as raised:
             await anyio.sleep(1.0)
             station.fail(LinkError("gone", link="x"), for_good=True)
+        assert [type(each) for each in raised] == [LinkError]
         with pytest.raises(LinkError):
             await read(session, "MC_ROLL_P")
         station.resume(anyio.current_time())
         with pytest.raises(LinkError):
             await read(session, "MC_ROLL_P")
-        assert len(raised) == 1
 
 
 @virtual_on_both
@@ -206,17 +182,11 @@ async def test_equal_reads_at_once_are_one_request_and_a_cancelled_one_ends_only
     name = vehicle.listed[5].name
     async with talking(Air.symmetric([vehicle], delay=0.05)) as (_, session):
         await read(session, vehicle.listed[0].name)
-        values: list[ReportedValue] = []
-
-        async def ask(seconds: float) -> None:
-            with anyio.move_on_after(seconds):
-                values.append(await read(session, name))
-
         before = vehicle.requests["PARAM_REQUEST_READ"]
-        async with anyio.create_task_group() as tasks:
-            for number in range(8):
-                tasks.start_soon(ask, 9.0 if number else 0.01)
-        assert len(values) == 7
+        async with meanwhile(*(read(session, name) for _ in range(7))) as values:
+            with anyio.move_on_after(0.01):
+                await read(session, name)
+        assert {each.param_id for each in values} == {name}
         assert vehicle.requests["PARAM_REQUEST_READ"] - before == 1
         await read(session, name)
         assert vehicle.requests["PARAM_REQUEST_READ"] - before == 2

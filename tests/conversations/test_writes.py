@@ -15,7 +15,7 @@ from paramclient.model.values import Encoding, ParamType, Trust, Value
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read, read_many, read_param
 from paramclient.protocol.session import Session
-from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetStatus
+from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.wire.messages import (
@@ -29,7 +29,7 @@ from paramclient.wire.messages import (
     encode,
 )
 from tests.conversations.partial import Partial
-from tests.conversations.virtual import Silence, Tap, converse, talking, virtual_on_both
+from tests.conversations.virtual import Silence, Tap, converse, meanwhile, talking, virtual_on_both
 
 EVERY_TYPE = {
     ParamType.UINT8: 255,
@@ -235,7 +235,7 @@ async def test_a_lost_acknowledgement_is_requested_again_and_a_lost_set_too() ->
 
 
 async def test_an_old_value_in_passing_proves_nothing_and_another_ones_is_no_adjustment() -> None:
-    for passing, status in ((4.0, "accepted"), (9.0, "accepted")):
+    for passing in (4.0, 9.0):
         vehicle = PX4Vehicle()
         async with talking(endpoint := Tap(Air.symmetric([vehicle], delay=0.1))) as (conversation, session):
             await read(session, "MC_ROLL_P")
@@ -246,17 +246,11 @@ async def test_an_old_value_in_passing_proves_nothing_and_another_ones_is_no_adj
                 return not isinstance(message, ParamSet) or sets[0] > 1
 
             endpoint.up = first_is_lost
-            async with anyio.create_task_group() as tasks:
-                results: list[object] = []
-
-                async def set_it(session: Session = session, results: list[object] = results) -> None:
-                    results.append((await write(session, "MC_ROLL_P", 3.5)).status)
-
-                tasks.start_soon(set_it)
+            async with meanwhile(write(session, "MC_ROLL_P", 3.5)) as results:
                 await anyio.sleep(0.05)
                 vehicle.load({"MC_ROLL_P": passing})  # as another station's set
                 conversation.hear(ParamValue("MC_ROLL_P", struct.pack("<f", passing), 9, 903, 65535))
-            assert results == [status]
+            assert [each.status for each in results] == ["accepted"]
             assert vehicle.param("MC_ROLL_P").value == 3.5
 
 
@@ -266,8 +260,7 @@ async def test_a_late_answer_with_an_old_value_undoes_no_acknowledged_write() ->
     async with talking(Air.symmetric([vehicle], delay=0.005)) as (conversation, session):
         await fetch_all(session)
         for step in range(8):
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(read, session, "ATC_ANG_RLL_P")
+            async with meanwhile(read(session, "ATC_ANG_RLL_P")):
                 await anyio.sleep(0.013 * step)
                 await write(session, "ATC_ANG_RLL_P", 3.0 + step)
             await anyio.sleep(1.0)
@@ -389,13 +382,7 @@ async def test_no_set_is_sent_to_another_vehicle_and_a_rebooted_one_gets_the_oth
             await anyio.sleep(30.0)
         floats = [each.name for each in first.listed if each.type is ParamType.REAL32]
         names = [name for name in floats if not name.startswith(("MPC", "LNDMC"))][:150]
-        results: list[SetManyResult] = []
-
-        async def set_all() -> None:
-            results.append(await write_many(session, [(name, 0.125) for name in names]))
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(set_all)
+        async with meanwhile(write_many(session, [(name, 0.125) for name in names])) as results:
             await anyio.sleep(0.25)
             if doubt == "an interrupted link":
                 conversation.station.interrupt()
@@ -449,22 +436,13 @@ async def test_another_vehicle_behind_a_value_ends_a_write_and_no_read() -> None
     ]
     async with talking(Air.symmetric([vehicle], delay=0.05)) as (conversation, session):
         await anyio.sleep(3.0)
-        outcomes: list[str] = []
-
-        async def run_call(call: Callable[[Session], Awaitable[object]]) -> None:
-            try:
-                outcomes.append(type(await call(session)).__name__)
-            except errors.ParamClientError as error:
-                outcomes.append(type(error).__name__)
-
-        for uid, (_, call) in enumerate(calls, start=20):
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(run_call, call)
+        for uid, (ends_with, call) in enumerate(calls, start=20):
+            async with meanwhile(call(session)) as outcomes:
                 await anyio.sleep(0.05)
                 for index, name in enumerate(table):
                     conversation.hear(ParamValue(name, vehicle.values[name], ParamType.REAL32, 2, index))
                 conversation.hear(AutopilotVersion(16, uid=uid))
-        assert outcomes == [outcome for outcome, _ in calls]
+            assert [type(each).__name__ for each in outcomes] == [ends_with]
         assert not vehicle.number_of(ParamSet)
 
 
@@ -541,13 +519,7 @@ async def test_a_link_that_fails_ends_a_batch_and_the_others_are_not_tried() -> 
     async with talking(Air.symmetric([vehicle], delay=0.3)) as (conversation, session):
         names = [each.name for each in vehicle.listed if each.type is ParamType.REAL32][:60]
         pairs: list[tuple[str, Value]] = [(name, 0.25) for name in names]
-        results: list[SetManyResult] = []
-
-        async def set_all() -> None:
-            results.append(await write_many(session, pairs))
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(set_all)
+        async with meanwhile(write_many(session, pairs)) as results:
             await anyio.sleep(2.0)
             conversation.station.fail(errors.LinkError("gone", link="x"), for_good=True)
         assert isinstance(results[0].error, errors.LinkError)

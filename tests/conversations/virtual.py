@@ -26,6 +26,7 @@ from paramclient.protocol.table import Change
 from paramclient.sim import Endpoint
 from paramclient.wire.frames import Framer
 from paramclient.wire.messages import DECODED_IDS, Heartbeat, Message, decode, encode
+from tests.shell import outcome
 
 T = TypeVar("T")
 
@@ -205,6 +206,20 @@ async def talking(endpoint: Endpoint, **options: Any) -> AsyncIterator[tuple[Con
     """Open a station on a simulated endpoint, and wait for 1/1: gives its plain parameters too."""
     async with converse(endpoint, **options) as conversation:
         yield conversation, (await conversation.node()).plain
+
+
+@asynccontextmanager
+async def meanwhile(*calls: Awaitable[Any]) -> AsyncIterator[list[Any]]:
+    """Begin some calls, and wait for them after the block: gives what each returns or raises, as they end."""
+    outcomes: list[Any] = []
+
+    async def run_call(call: Awaitable[Any]) -> None:
+        outcomes.append(await outcome(call))
+
+    async with anyio.create_task_group() as tasks:
+        for call in calls:
+            tasks.start_soon(run_call, call)
+        yield outcomes
 
 
 def messages_in(data: bytes) -> list[Message]:
