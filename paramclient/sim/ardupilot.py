@@ -8,7 +8,7 @@ import struct
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from paramclient.errors import CommandResult, ParamErrorCode
@@ -16,13 +16,7 @@ from paramclient.model.values import Encoding, ParamType, bits_of
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.param_pck import PARAM_FILE
 from paramclient.sim.ftp import Address, FileServer
-from paramclient.sim.param_table import (
-    Entry,
-    Table,
-    ardupilot_table,
-    as_table,
-    ek2_group,
-)
+from paramclient.sim.param_table import Entry, Table, ardupilot_table, as_table, ek2_group
 from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
 
@@ -94,6 +88,7 @@ class ArduPilotVehicle(Vehicle):
 
     encoding: ClassVar = Encoding.C_CAST
     _restart_delay: ClassVar = 0.2
+    _system_id: ClassVar = "SYSID_THISMAV"
     _clock_delay: ClassVar = 1.4
     _armed_result: ClassVar = CommandResult.FAILED
 
@@ -116,32 +111,24 @@ class ArduPilotVehicle(Vehicle):
         if groups is None:
             groups = {"EK2_ENABLE": ek2_group()} if is_built_in else {}
         members = {switch: as_table(group) for switch, group in groups.items()}
-        table = tuple(replace(row, value=self.system) if row.name == _SYSTEM_ID else row for row in table)
         rows = tuple(each for row in table for each in (row, *members.get(row.name, ())))
-        self._in_groups = (
-            frozenset(row.name for row in table[_NOT_IN_GROUPS:]) if is_built_in else frozenset()
-        )
+        self._in_groups = frozenset(row.name for row in table[_NOT_IN_GROUPS:] if is_built_in)
         self._switch_of = {row.name: switch for switch, group in members.items() for row in group}
         self._switches = members.keys()
         self._late_switches = frozenset(self.reboot_groups)
         self._was_on = {row.name for row in rows if row.bits != 0}
-        self._read_only = frozenset(
-            [row.name for row in rows if _INTERNAL.fullmatch(row.name)]
-            if self.read_only is None
-            else self.read_only
-        )
+        internal = [row.name for row in rows if _INTERNAL.fullmatch(row.name)]
+        self._read_only = frozenset(internal if self.read_only is None else self.read_only)
         self._live = frozenset(self.live)
         uid2 = (int.from_bytes(_UID2, "little") + self.system - 1).to_bytes(18, "little")
         uid2 = uid2 if self.uid2 is None else self.uid2.ljust(18, b"\0")
         self._stored: set[Entry] = set()
         """Parameters that have had another value than at the first start."""
         self._list_fills_loop = self.burst > _BUSY_RATE * self.period
-        vehicle_type, state, _ = _KINDS[self.kind]
+        kind, state, _ = _KINDS[self.kind]
         self._set_up_table(
             rows,
-            messages.Heartbeat(
-                vehicle_type, messages.MAV_AUTOPILOT_ARDUPILOTMEGA, base_mode=81, system_status=state
-            ),
+            messages.Heartbeat(kind, messages.MAV_AUTOPILOT_ARDUPILOTMEGA, 81, system_status=state),
             messages.AutopilotVersion(
                 64495 if self.ftp else 64495 & ~messages.CAPABILITY_FTP,
                 flight_sw_version=67502080,
@@ -170,14 +157,8 @@ class ArduPilotVehicle(Vehicle):
             self._due[self._change_live] = at + self.live_period
 
     def _tasks(self) -> list[Callable[[float], None]]:
-        first = [
-            self._change_system_id,
-            self._measure,
-            self._change_live,
-            self._end_look_up,
-            self._send_reads,
-        ]
-        return [*first, *super()._tasks(), self._open_window, self._answer_sets]
+        first = [self._change_system_id, self._measure, self._change_live, self._end_look_up]
+        return [*first, self._send_reads, *super()._tasks(), self._open_window, self._answer_sets]
 
     def _next(self, period: float, *, after: float | None = None) -> float:
         """Return the start of the next period; periods are counted from switching on."""
@@ -191,7 +172,7 @@ class ArduPilotVehicle(Vehicle):
     def _end_all(self) -> None:
         super()._end_all()
         self._was_on = {entry.name for entry in self.entries if entry.bits != 0}
-        self._take_system_id(_SYSTEM_ID)
+        self._take_system_id()
 
     def _state_after_reboot(self) -> tuple[int, float]:
         return _KINDS[self.kind][2]
@@ -206,11 +187,7 @@ class ArduPilotVehicle(Vehicle):
             value = entry.value
             if entry.name == _BOOT_COUNT:
                 entry.store(entry.bits + 1 & 0x7FFF)
-            elif (
-                _MEASURED.fullmatch(entry.name)
-                and isinstance(value, float)
-                and value not in (0.0, _NO_SENSOR)
-            ):
+            elif isinstance(value, float) and value and value != _NO_SENSOR and _MEASURED(entry.name):
                 entry.store(bits_of(1.001 * value, entry.type))
 
     def _change_live(self, at: float) -> None:
@@ -225,7 +202,7 @@ class ArduPilotVehicle(Vehicle):
                     self._write(entry, entry.bits ^ 1)
 
     def _change_system_id(self, at: float) -> None:
-        self._take_system_id(_SYSTEM_ID)
+        self._take_system_id()
 
     # Groups
 
@@ -274,7 +251,7 @@ class ArduPilotVehicle(Vehicle):
         super()._store(entry, bits)
         if entry.name in self._switches:
             self._relist()
-        if entry.name == _SYSTEM_ID and self.kind != "copter":
+        if entry.name == self._system_id and self.kind != "copter":
             self._due[self._change_system_id] = self._next(1.0)
 
     def _answer_sets(self, at: float) -> None:
@@ -428,11 +405,10 @@ class ArduPilotVehicle(Vehicle):
 
 
 _INTERNAL = re.compile(r"MIS_TOTAL|BARO\d_(GND_PRESS|DEVID)|ARSPD\d?_DEVID|MNT\d_DEVID")
-_MEASURED = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR2_CALTEMP|BARO\d_GND_PRESS")
+_MEASURED = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR2_CALTEMP|BARO\d_GND_PRESS").fullmatch
 _NO_SENSOR = -300.0
 """Calibration temperature without a sensor, in °C."""
 _BOOT_COUNT = "STAT_BOOTCNT"
-_SYSTEM_ID = "SYSID_THISMAV"
 _STANDBY = 3
 _CALIBRATING = 2
 _KINDS: dict[str, tuple[int, int, tuple[int, float]]] = {

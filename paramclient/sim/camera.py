@@ -17,8 +17,9 @@ from paramclient.model.values import (
     encode_ext_value,
     ext_bytes,
     ext_param,
+    parse_ext_value,
 )
-from paramclient.sim.param_table import Table, as_table, typed
+from paramclient.sim.param_table import Table, as_table, rows_of, typed
 from paramclient.sim.vehicle import Vehicle
 from paramclient.wire import frames, messages
 
@@ -33,25 +34,8 @@ text and bytes CUSTOM, and `(type, value)` gives another type."""
 
 def camera_table() -> ExtEntries:
     """Return the extended parameters of a usual camera, every type among them."""
-    kinds = ParamType
-    return {
-        "CAM_MODE": (kinds.UINT32, 1),
-        "CAM_WBMODE": (kinds.UINT32, 0),
-        "CAM_EXPMODE": (kinds.UINT8, 0),
-        "CAM_ISO": (kinds.UINT32, 100),
-        "CAM_SHUTTERSPD": (kinds.REAL32, 1 / 60),
-        "CAM_EV": (kinds.REAL32, 0.0),
-        "CAM_ROTATION": (kinds.INT16, -90),
-        "CAM_TILT": (kinds.INT8, -15),
-        "CAM_VIDRES": (kinds.UINT16, 3840),
-        "CAM_STORAGE": (kinds.UINT64, 256_060_514_304),
-        "CAM_CLOCK": (kinds.INT64, 1_700_000_000_123_456_789),
-        "CAM_FOCAL_LEN": (kinds.REAL64, 0.0239999999999999),
-        "CAM_OFFSET": (kinds.INT32, -20),
-        "CAM_NAME": "Front camera",
-        "CAM_STREAM_URI": "rtsp://192.168.42.1:8554/live?profile=high&bitrate=8000000",
-        "CAM_LICENSE": bytes(range(1, 33)),
-    }
+    rows = ((row["name"], ParamType[row["type"]], row["value"]) for row in rows_of("camera.csv"))
+    return {name: (kind, parse_ext_value(name, text, kind)) for name, kind, text in rows}
 
 
 @dataclass(kw_only=True, eq=False, repr=False)

@@ -123,11 +123,7 @@ class Device:
 
     def send(self, message: messages.Message) -> None:
         """Send a message. A subclass may drop some, or send others instead."""
-        system, component, sequence = self.system, self.component, self._sequence
-        version = self.mavlink_version
-        self._queue(
-            messages.encode(message, system=system, component=component, sequence=sequence, version=version)
-        )
+        self._send_frame(messages.encode, message)
 
     # Time
 
@@ -238,18 +234,12 @@ class Device:
 
     def _send_attitude(self) -> None:
         payload = self._time_boot_ms(self._now).to_bytes(4, "little") + _LEVEL_FLIGHT
-        self._queue(
-            frames.build_frame(
-                _ATTITUDE,
-                payload,
-                system=self.system,
-                component=self.component,
-                sequence=self._sequence,
-                version=self.mavlink_version,
-            )
-        )
+        self._send_frame(frames.build_frame, _ATTITUDE, payload)
 
-    def _queue(self, frame: bytes) -> None:
+    def _send_frame(self, build: Callable[..., bytes], *content: object) -> None:
+        """Send the frame that a function builds of this content."""
+        ids = {"system": self.system, "component": self.component, "version": self.mavlink_version}
+        frame = build(*content, **ids, sequence=self._sequence)
         self._sequence = (self._sequence + 1) & 0xFF
         if self._signer is not None:
             frame = frames.sign_frame(frame, self._signer)

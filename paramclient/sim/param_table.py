@@ -171,10 +171,15 @@ def check_range(low: float, high: float = sys.float_info.max, /, **numbers: floa
             raise UsageError(f"{name} must be {limits}, not {number}")
 
 
-def _read(name: str) -> tuple[SimParam, ...]:
+def rows_of(name: str) -> Iterable[dict[str, str]]:
+    """Return the rows of a stored table."""
     text = resources.files(__package__).joinpath("tables", name).read_text(encoding="ascii")
+    return csv.DictReader(text.splitlines())
+
+
+def _read(name: str) -> tuple[SimParam, ...]:
     rows = []
-    for row in csv.DictReader(text.splitlines()):
+    for row in rows_of(name):
         kind = ParamType[row["type"]]
         value = int(row["value"]) if kind.is_integer else float(row["value"])
         default = float(row["default"]) if "default" in row else None

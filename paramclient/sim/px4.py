@@ -7,23 +7,16 @@ import lzma
 import math
 import zlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from typing import Any, ClassVar, Final
 
-from paramclient.errors import CommandResult, ParamErrorCode
+from paramclient.errors import CommandResult
 from paramclient.model.px4_hash import crc32_px4, hash_bits
-from paramclient.model.values import TYPES_BY_NAME, ParamType, bits_of
+from paramclient.model.values import ParamType, bits_of
 from paramclient.sim.ftp import FileServer
-from paramclient.sim.param_table import (
-    Entry,
-    SimParam,
-    Table,
-    as_table,
-    px4_table,
-    third_compass,
-)
+from paramclient.sim.param_table import Entry, SimParam, Table, as_table, px4_table, third_compass
 from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
 
@@ -111,6 +104,8 @@ class PX4Vehicle(Vehicle):
 
     _ack_first: ClassVar = False
     _restart_delay: ClassVar = 0.4
+    _system_id: ClassVar = "MAV_SYS_ID"
+    _reports_wrong_type: ClassVar = False
 
     table: Table | None = None
     uid: int | None = None
@@ -128,8 +123,7 @@ class PX4Vehicle(Vehicle):
 
     def __post_init__(self) -> None:
         is_built_in = self.table is None
-        table = px4_table() if self.table is None else as_table(self.table)
-        rows = tuple(replace(row, value=self.system) if row.name == _SYSTEM_ID else row for row in table)
+        rows = px4_table() if self.table is None else as_table(self.table)
         content = repr([(row.name, int(row.type), row.bits) for row in rows]).encode()
         own = SIMULATED_COMMIT if is_built_in else f"{zlib.crc32(content):08x}"
         commit = SIMULATED_COMMIT + own  # metadata is stored by commit
@@ -147,13 +141,7 @@ class PX4Vehicle(Vehicle):
         self._hash: int | None = None
         self._set_up_table(
             sorted(rows, key=lambda row: row.name),
-            messages.Heartbeat(
-                _QUADROTOR,
-                messages.MAV_AUTOPILOT_PX4,
-                base_mode=29,
-                custom_mode=50593792,
-                system_status=_STANDBY,
-            ),
+            _HEARTBEAT,
             messages.AutopilotVersion(
                 59647,
                 flight_sw_version=_MAIN if self.ftp else _RELEASE,
@@ -229,9 +217,6 @@ class PX4Vehicle(Vehicle):
             self._position = None
             self._hash_next = False
 
-    def _on_wrong_type(self, entry: Entry, request: messages.ParamSet, sender: frames.Frame) -> None:
-        self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
-
     # Changes
 
     def _write(self, entry: Entry, bits: int) -> None:
@@ -264,9 +249,9 @@ class PX4Vehicle(Vehicle):
                 if not entry.name.startswith(RESET_KEEPS):
                     entry.store(entry.row.bits)
             autoconfig.store(0)
-            if (system := self._find(_SYSTEM_ID)) is not None:
+            if (system := self._find(self._system_id)) is not None:
                 system.store(1)
-        self._take_system_id(_SYSTEM_ID)
+        self._take_system_id()
 
     def _switch_on(self, at: float) -> None:
         self._unused = set(self._never_used)
@@ -342,11 +327,10 @@ class PX4Vehicle(Vehicle):
 
 _LIMITED = frozenset(name for limit in LIMITS for name in limit if isinstance(name, str))
 _FIRST_START_ONLY = frozenset({"CAL_BARO1_ID", "CAL_BARO2_ID", "CAL_BARO3_ID"})
-_SYSTEM_ID = "MAV_SYS_ID"
 _METADATA = messages.message_id(messages.ComponentMetadata)
 _UNINIT = 0
-_STANDBY = 3
-_QUADROTOR = 2
+_HEARTBEAT = messages.Heartbeat(2, messages.MAV_AUTOPILOT_PX4, 29, 50593792, system_status=3)
+"""A quadrotor on standby."""
 _RELEASE = 17891392
 """flight_sw_version of 1.17.0."""
 _MAIN = 0x01120000
@@ -383,24 +367,12 @@ def _packed(document: dict[str, Any]) -> bytes:
 
 
 def _described(row: SimParam) -> dict[str, Any]:
-    value = row.value
     described: dict[str, Any] = {
         "name": row.name,
-        "group": row.name.partition("_")[0],
-        "category": "Standard",
+        "type": "Float" if row.type == ParamType.REAL32 else ParamType(row.type).name.capitalize(),
         "shortDesc": f"{row.name} of the simulated vehicle",
+        "group": row.name.partition("_")[0],
+        "volatile": row.volatile,
     }
-    if row.type in _TYPES:
-        described["type"] = _TYPES[row.type]
-    if isinstance(value, int | float) and math.isfinite(value):
-        described["default"] = value
-    if row.volatile:
-        described["volatile"] = True
-    return described
-
-
-_TYPES: Final[dict[int, str]] = {
-    kind: "Float" if kind is ParamType.REAL32 else kind.name.capitalize()
-    for kind in TYPES_BY_NAME.values()
-    if kind.size <= 4
-}
+    value = row.value
+    return described | ({"default": value} if isinstance(value, int | float) and math.isfinite(value) else {})

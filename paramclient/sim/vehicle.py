@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Final
 
 from paramclient.errors import ParamErrorCode, UsageError
@@ -60,6 +60,10 @@ class Vehicle(Device):
     """
 
     encoding: ClassVar = Encoding.BYTEWISE
+    _system_id: ClassVar = ""
+    """The parameter that contains the system id."""
+    _reports_wrong_type: ClassVar = True
+    """Whether the response to a set of another type is the current value."""
 
     burst: int = 10
     period: float = 0.01
@@ -74,7 +78,8 @@ class Vehicle(Device):
         file_server: FileServer | None = None,
     ) -> None:
         """Check the arguments, and prepare the first start."""
-        self.entries = [Entry(row, order, self.encoding) for order, row in enumerate(rows)]
+        own = (replace(row, value=self.system) if row.name == self._system_id else row for row in rows)
+        self.entries = [Entry(row, order, self.encoding) for order, row in enumerate(own)]
         self._by_name = {self._key(entry.name): entry for entry in reversed(self.entries)}
         if len({entry.name for entry in self.entries}) < len(self.entries):
             raise UsageError("the table contains a parameter name twice")
@@ -187,16 +192,12 @@ class Vehicle(Device):
         if entry is None:
             self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
         elif entry.type != request.param_type:
-            self._on_wrong_type(entry, request, sender)
+            self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
+            if self._reports_wrong_type and not self.param_error:
+                self._send_value(entry)
         else:
             size = ParamType(entry.type).size if entry.type <= ParamType.CUSTOM else 4
             self._write(entry, int.from_bytes(request.raw[:size], "little"))
-            self._send_value(entry)
-
-    def _on_wrong_type(self, entry: Entry, request: messages.ParamSet, sender: frames.Frame) -> None:
-        if self.param_error:
-            self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
-        else:
             self._send_value(entry)
 
     def _write(self, entry: Entry, bits: int) -> None:
@@ -292,9 +293,9 @@ class Vehicle(Device):
         packed = [each for entry in self._listed if (each := entry.packed) is not None]
         return packed if len(packed) == len(self._listed) else None
 
-    def _take_system_id(self, name: str) -> None:
-        """Use the system id in a parameter, if the parameter exists and its value is a valid id."""
-        entry = self._find(name)
+    def _take_system_id(self) -> None:
+        """Use the system id in the parameter, if the parameter exists and its value is a valid id."""
+        entry = self._find(self._system_id)
         if entry is not None and isinstance(entry.value, int) and 1 <= entry.value <= 255:
             self.system = entry.value
 

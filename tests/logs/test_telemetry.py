@@ -9,15 +9,7 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import (
-    LinkError,
-    NoReply,
-    ParamCache,
-    ParamClient,
-    SyncState,
-    Trust,
-    UsageError,
-)
+from paramclient import LinkError, NoReply, ParamCache, ParamClient, SyncState, Trust, UsageError
 from paramclient.cache import BY_US, StoredParam, TableUpdate
 from paramclient.links.tlog import PAUSE_MAX
 from paramclient.logs.imports import ImportedTable, import_log

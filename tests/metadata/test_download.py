@@ -22,16 +22,7 @@ from paramclient.model.px4_hash import crc32_px4
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.sim.px4 import GENERAL_FILE, METADATA_FILE
 from paramclient.wire.messages import FileTransfer
-from tests.shell import (
-    Tap,
-    a_client,
-    generic,
-    in_simulated_time,
-    outcome,
-    residue,
-    small_px4,
-    tasks_beside,
-)
+from tests.shell import Tap, a_client, generic, in_simulated_time, outcome, residue, small_px4, tasks_beside
 
 IDENTITY = Identity(1, "link", "abcd", 12, 2, 0x01110000, "0123abcd", 1)
 

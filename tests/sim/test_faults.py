@@ -11,12 +11,7 @@ import pytest
 
 from paramclient.errors import CommandResult
 from paramclient.model.values import Encoding, ParamType
-from paramclient.sim import (
-    ArduPilotVehicle,
-    GenericVehicle,
-    PX4Vehicle,
-    Vehicle,
-)
+from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import frames, messages
 from tests.ground_station import LIST, Station, indices, names, read, write
 

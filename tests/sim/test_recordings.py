@@ -9,15 +9,7 @@ from collections.abc import Callable, Iterable
 import pytest
 
 from paramclient.model.px4_hash import hash_bits
-from paramclient.model.values import (
-    Encoding,
-    Param,
-    ParamType,
-    Value,
-    decode_value,
-    encode_value,
-    from_bits,
-)
+from paramclient.model.values import Encoding, Param, ParamType, Value, decode_value, encode_value, from_bits
 from paramclient.protocol import param_pck
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam, ardupilot_table, px4_table
