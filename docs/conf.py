@@ -14,7 +14,7 @@ version = release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["_build"]
 default_role = "py:obj"
-suppress_warnings = ["ref.python"]  # a word in backticks, such as `params`, may be a member of several classes
+suppress_warnings = ["ref.python"]  # a word in backticks may be a member of several classes
 myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
