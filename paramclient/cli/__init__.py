@@ -1,13 +1,12 @@
 """The command line: parses arguments, calls the client, and prints tables or JSON.
 
 - `app`: all subcommands, the main function, signals and errors.
-- Subcommands: `read_commands` (fetch, get, watch), `set_command` with `writes`, `reset_command`,
-  `show` (show, search, info), `cached` (cache, import, history), `apply` (apply, restore),
-  `save`, `diff`, `metadata`, `link`, `check`, `ports`, `signing`, `serve` (serve, token) and `simulate`
-  (sim).
+- Subcommands: `read_commands` (fetch, get, watch), `set_command` with `writes`, `reset_command`, `apply`
+  (apply, restore), `show` (show, search, info), `cached` (cache, import, history), `save`, `diff`,
+  `metadata`, `link` (link, ports), `check`, `signing` and `serve` (serve, token, sim).
 - `session`: open links with the vehicles of --vehicle, on which a subcommand works. `options`: options.
 - `sources`: the parameters that an argument names: of a file, a link or the cache.
-- `param_names`: names and patterns of parameters, and suggestions.
+- `param_names`: names and patterns of parameters.
 - `metadata`: descriptions and defaults that a subcommand uses.
 - `output`: tables, lines, the status line, exit codes.
 - `json_output`: JSON.

@@ -19,6 +19,8 @@ from paramclient.cli.output import STDIN, ExitCode, code_of, report, say, text_o
 from paramclient.errors import ParamClientError
 from paramclient.version import __version__
 
+_HELPED: Final = frozenset({"--help", "-h", "cache", "metadata", "signing"})
+"""Words with which help is printed that describes each subcommand; groups print it where none follows."""
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -29,8 +31,7 @@ def run(arguments: Sequence[str]) -> int:
         KeyboardInterrupt: Ctrl-C while nothing is awaited, or a second Ctrl-C.
         BrokenPipeError: the reader of stdout has closed it.
     """
-    shows_help = _shows_help(arguments)
-    if shows_help:
+    if not arguments or not _HELPED.isdisjoint(arguments):
         dict(subcommands())  # imports all of them, so that the help can describe each
     with _messages_shown(verbose=not {"--verbose", "-v"}.isdisjoint(arguments)):
         try:
@@ -48,19 +49,11 @@ def run(arguments: Sequence[str]) -> int:
         except BrokenPipeError:
             raise
         except SystemExit:  # from rich: the reader of the help, such as head, has closed it
-            if not shows_help:
-                raise
             code = ExitCode.DONE
         except OSError as error:  # of stdout: the library translates all others into its own errors
             report(f"cannot write the output: {error.strerror}")
             return ExitCode.INCOMPLETE
     return code or ExitCode.DONE
-
-
-def _shows_help(arguments: Sequence[str]) -> bool:
-    """Return whether help is printed: with --help, and without a subcommand."""
-    is_group = len(arguments) == 1 and arguments[0] in ("cache", "metadata", "signing")
-    return not arguments or is_group or any(word in _app.help_flags for word in arguments)
 
 
 def _usage_text(error: CycloptsError) -> str:
@@ -216,8 +209,8 @@ _add(_app, "apply:restore", "URL [WHEN|FILE]", "sim:px4 --dry-run", "udpin:0.0.0
 _add(_app, "cached:import_", "FILE [FILE...]", "flight.tlog")
 _add(_app, "serve:serve", "LINK [LINK...]", "serial:/dev/ttyACM0:57600 --listen 127.0.0.1:0")
 _add(_app, "serve:token", None, "anna --file tokens", "wall-display --file tokens --read")
-_add(_app, "ports:ports")
-_add(_app, "simulate:sim", None, "px4 --link udpout:127.0.0.1:14550", "'ardupilot?loss=0.05&seed=1'")
+_add(_app, "link:ports")
+_add(_app, "serve:sim", None, "px4 --link udpout:127.0.0.1:14550", "'ardupilot?loss=0.05&seed=1'")
 for _group in (_cache, _metadata, _signing):
     _app.command(_group)
 _add(_signing, "signing:setup", None, "udpin:0.0.0.0:14550 --signing-key vehicle.key")

@@ -1,22 +1,32 @@
-"""The subcommand link: components, message rates and packet loss on a link."""
+"""The subcommands link, with components, message rates and packet loss of a link, and ports."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import asdict
 from typing import Final
 
 import anyio
 
 from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import Seconds, TrafficOptions
-from paramclient.cli.output import ExitCode, clear_screen, milliseconds, print_json, print_line, print_table
+from paramclient.cli.output import (
+    ExitCode,
+    clear_screen,
+    milliseconds,
+    print_json,
+    print_line,
+    print_table,
+    show,
+)
 from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.taps import ComponentTraffic, TrafficReport
 from paramclient.errors import NoReply, ParamClientError
+from paramclient.links import list_ports
 from paramclient.model.identity import autopilot_name
 from paramclient.model.notation import rounded
 from paramclient.protocol.channel import task_group
@@ -200,3 +210,35 @@ def _lines(found: JsonObject) -> Iterator[str]:
             for reason, count in signing[name].items()
         ]
         yield f"key {signing['fingerprint']}: {signing['signed']:,} frames proven{''.join(others)}"
+
+
+# ports
+
+
+def ports(*, json: bool = False) -> ExitCode:
+    """List the serial ports of this computer, autopilots first.
+
+    Needs the extra `serial`: pip install 'paramclient[serial]'.
+
+    Args:
+        json: Print JSON.
+    """
+    found = [
+        {
+            **asdict(port),
+            "link": port.link,
+            "autopilot": port.autopilot,
+            "vendor_id": None if port.vendor_id is None else f"{port.vendor_id:04x}",
+            "product_id": None if port.product_id is None else f"{port.product_id:04x}",
+        }
+        for port in list_ports()
+    ]
+    columns = ["device", "autopilot", "product", "manufacturer", "vendor_id", "product_id", "link"]
+    show(
+        {"ports": found},
+        columns,
+        ([port[name] for name in columns] for port in found),
+        json=json,
+        empty="this computer has no serial ports",
+    )
+    return ExitCode.DONE

@@ -21,18 +21,8 @@ from typing import ClassVar, Final, Self, TextIO
 import anyio
 import anyio.to_thread
 
-from paramclient.errors import (
-    AmbiguousVehicle,
-    CacheError,
-    InvalidParameters,
-    LinkError,
-    NoReply,
-    PackError,
-    ParamClientError,
-    UnknownParameter,
-    UsageError,
-    VehicleError,
-)
+from paramclient import errors
+from paramclient.errors import ParamClientError
 from paramclient.model.values import Param
 from paramclient.protocol.fetch import Progress
 
@@ -329,31 +319,31 @@ def code_of(error: ParamClientError) -> ExitCode:
 
 def text_of(error: ParamClientError, *, takes_all: bool) -> str:
     """Return the message of an error for the command line, with options in place of Python arguments."""
-    if isinstance(error, AmbiguousVehicle) and error.choose_by:
+    if isinstance(error, errors.AmbiguousVehicle) and error.choose_by:
         address = error.vehicles[0].partition(" ")[0] if error.vehicles else "1/1"
         all_too = ", or all with --vehicle all" if takes_all and error.choose_by == "system" else ""
         return f"{error.summary} Choose one with --vehicle {address}{all_too}."
-    if isinstance(error, InvalidParameters):
+    if isinstance(error, errors.InvalidParameters):
         return f"{error}\n--partial skips these, and writes the others"
     return str(error)
 
 
 _CODES: Final = {
-    UnknownParameter: ExitCode.USAGE,  # as everywhere for a name that does not exist
-    VehicleError: ExitCode.INCOMPLETE,
-    PackError: ExitCode.INCOMPLETE,
-    UsageError: ExitCode.USAGE,
-    NoReply: ExitCode.NO_ANSWER,
-    LinkError: ExitCode.LINK,
-    CacheError: ExitCode.CACHE,
+    errors.UnknownParameter: ExitCode.USAGE,  # as everywhere for a name that does not exist
+    errors.VehicleError: ExitCode.INCOMPLETE,
+    errors.PackError: ExitCode.INCOMPLETE,
+    errors.UsageError: ExitCode.USAGE,
+    errors.NoReply: ExitCode.NO_ANSWER,
+    errors.LinkError: ExitCode.LINK,
+    errors.CacheError: ExitCode.CACHE,
 }
 """Exit codes by class of error; the first class that matches applies."""
 
 
-def report_all(errors: Iterable[ParamClientError], prefix: str = "") -> int:
+def report_all(found: Iterable[ParamClientError], prefix: str = "") -> int:
     """Print every error; return the exit code for all of them."""
     worst = ExitCode.DONE
-    for error in errors:
+    for error in found:
         report(f"{prefix}{error}")
         worst = max(worst, code_of(error))
     return worst

@@ -1,47 +1,61 @@
-"""Parameter names in arguments: patterns, upper and lower case, and suggestions for unknown names."""
+"""Parameters that arguments name: by names in upper or lower case, and by patterns."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
-import anyio.to_thread
+import anyio
 
-from paramclient.cache import ParamCache
+from paramclient.cli.output import Status
 from paramclient.cli.session import CommandSession
 from paramclient.client.component import Component
-from paramclient.errors import CacheError, ParamClientError, UnknownParameter, UsageError
-from paramclient.model.identity import autopilot_name
-from paramclient.model.names import NameChoice, did_you_mean, is_pattern, nearest_names
-from paramclient.model.values import check_name
+from paramclient.errors import ParamClientError, UnknownParameter, UsageError
+from paramclient.model.names import NameChoice, first_of, is_pattern
+from paramclient.model.values import Param, Trust, check_name
 
-CACHED_TABLES_MAX: Final = 20
-"""Tables of the cache whose names are suggested, those of the vehicles received last: few firmwares
-differ."""
+AWAITED_NAMES_MAX: Final = 3
+"""Parameters that the line about awaited values names."""
 _CAPITALS: Final = ("px4", "ardupilot")
 """Autopilots whose parameters all have names in capitals."""
 
 
-def choose_names(component: Component, given: Iterable[str]) -> tuple[list[str], dict[str, ParamClientError]]:
-    """Choose among the known parameters of a component by names and patterns.
+async def get_chosen(
+    session: CommandSession, given: Sequence[str], *, is_fetched: bool = False
+) -> tuple[list[Param], dict[str, ParamClientError]]:
+    """Read the parameters that names and patterns choose; return them, and the errors by name.
 
-    Returns:
-        The names in the vehicle's spelling, among them those that the vehicle may not have; and errors by
-        pattern for the patterns without a match.
+    With a pattern, the table is fetched, unless it is already. Values that were received or confirmed by that
+    are not read again.
     """
-    names: dict[str, None] = {}
-    errors: dict[str, ParamClientError] = {}
+    component = session.component
+    if not is_fetched and (is_fetched := any(map(is_pattern, given))):
+        await session.fetch()
+    known = component.params if is_fetched else {}
+    fresh = {name: param for name, param in known.items() if param.trust is not Trust.CACHED}
+    found: dict[str, Param | ParamClientError | None] = {}
     for text in given:
-        if not is_pattern(text):
-            names[spelling(text, component)] = None
-            continue
-        chosen, _ = NameChoice([text]).divide(component.params)
-        names |= dict.fromkeys(sorted(chosen))
-        if not chosen:
-            system, number = component.address
-            what = f"{system}/{number} has no parameter that matches {text}"
-            errors[text] = UnknownParameter(what, system, number, name=text)
-    return list(names), errors
+        names = [spelling(text, component)]
+        if is_pattern(text):
+            names = sorted(NameChoice([text]).divide(component.params)[0])
+        if not names:
+            what = f"{session.address} has no parameter that matches {text}"
+            found[text] = UnknownParameter(what, *component.address, name=text)
+        found |= {name: fresh.get(name) for name in names}
+    requested = [name for name, each in found.items() if each is None]
+
+    async def read(name: str) -> None:
+        try:
+            found[name] = await component.get(name, timeout=session.deadline.left())
+        except ParamClientError as error:
+            found[name] = error
+
+    with Status(f"waiting for {first_of(requested, AWAITED_NAMES_MAX)} of {session.label}"):
+        async with anyio.create_task_group() as tasks:
+            for name in requested:
+                tasks.start_soon(read, name)
+    errors = {name: each for name, each in found.items() if isinstance(each, ParamClientError)}
+    return [each for each in found.values() if isinstance(each, Param)], errors
 
 
 def check_given(given: Iterable[str]) -> list[str]:
@@ -57,50 +71,6 @@ def check_given(given: Iterable[str]) -> list[str]:
         elif not (text.isascii() and text.isprintable()):
             raise UsageError(f"pattern {text!r}: only printable ASCII characters are allowed")
     return chosen
-
-
-async def suggest(
-    session: CommandSession, errors: dict[str, ParamClientError]
-) -> dict[str, ParamClientError]:
-    """Return the errors with suggestions from the cache for names to which the vehicle has no similar one."""
-    cache = session.client.cache
-    lacking = {
-        name: error
-        for name, error in errors.items()
-        if isinstance(error, UnknownParameter) and not (error.nearest or is_pattern(name))
-    }
-    if cache is None or not lacking:
-        return errors
-    known = await anyio.to_thread.run_sync(_cached_names, cache, session.component.autopilot)
-    better: dict[str, ParamClientError] = {}
-    for name, error in lacking.items():
-        if nearest := nearest_names(name, known):
-            system, component = error.system, error.component
-            text = f"{system}/{component} has no {name}{did_you_mean(nearest)}"
-            better[name] = UnknownParameter(text, system, component, name=name, nearest=nearest)
-    return errors | better
-
-
-def _cached_names(cache: ParamCache, autopilot: str | None = None) -> frozenset[str]:
-    """Return the names of the parameters in the cache; none if the cache cannot be read.
-
-    Args:
-        cache: the cache.
-        autopilot: only those of this autopilot; None for all.
-    """
-    names: set[str] = set()
-    try:
-        summaries = [
-            each
-            for each in cache.components()
-            if autopilot in (None, autopilot_name(each.autopilot), autopilot_name(each.identity.autopilot))
-        ]
-        for each in summaries[:CACHED_TABLES_MAX]:
-            table = cache.load(each.key, each.component)
-            names.update(() if table is None else table.params)
-    except CacheError:
-        return frozenset()
-    return frozenset(names)
 
 
 def spelling(name: str, component: Component) -> str:

@@ -25,7 +25,6 @@ from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     LINE_NAMES_MAX,
     ExitCode,
-    Status,
     by_index,
     local_time,
     milliseconds,
@@ -35,22 +34,19 @@ from paramclient.cli.output import (
     report_all,
     say,
 )
-from paramclient.cli.param_names import check_given, choose_names, suggest
+from paramclient.cli.param_names import check_given, get_chosen
 from paramclient.cli.session import CommandSession, Sessions, sessions
 from paramclient.client.client import Event
 from paramclient.errors import ParamClientError, VehicleError
 from paramclient.links import ReplayLink
 from paramclient.metadata import Metadata
-from paramclient.model.names import NameChoice, counted, first_of, is_pattern
+from paramclient.model.names import NameChoice, counted, first_of
 from paramclient.model.notation import hash_text, rounded, time_text
 from paramclient.model.paramset import add_default, default_of
-from paramclient.model.values import Param, Trust, format_value
+from paramclient.model.values import Param, format_value
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.table import Change
-
-AWAITED_NAMES_MAX: Final = 3
-"""Parameters that the line about awaited values names."""
 
 _DEFAULTS: Final = LinkOptions()
 
@@ -226,37 +222,6 @@ class _Read:
 
 def _cells(param: Param) -> Sequence[object]:
     return param.name, format_value(param.settable, param.type), param.type.name, param.index
-
-
-async def get_chosen(
-    session: CommandSession, name_patterns: Sequence[str], *, is_fetched: bool = False
-) -> tuple[list[Param], dict[str, ParamClientError]]:
-    """Read the parameters that names and patterns choose; return them, and the errors by name.
-
-    With a pattern, the table is fetched, unless it is already. Values that were received or confirmed by that
-    are not read again.
-    """
-    component = session.component
-    if not is_fetched and (is_fetched := any(map(is_pattern, name_patterns))):
-        await session.fetch()
-    names, unmatched = choose_names(component, name_patterns)
-    known = component.params if is_fetched else {}
-    found = {name: known[name] for name in names if name in known and known[name].trust is not Trust.CACHED}
-    requested = [name for name in names if name not in found]
-    errors: dict[str, ParamClientError] = {}
-
-    async def read(name: str) -> None:
-        try:
-            found[name] = await component.get(name, timeout=session.deadline.left())
-        except ParamClientError as error:
-            errors[name] = error
-
-    with Status(f"waiting for {first_of(requested, AWAITED_NAMES_MAX)} of {session.label}"):
-        async with anyio.create_task_group() as tasks:
-            for name in requested:
-                tasks.start_soon(read, name)
-    in_order = {name: errors[name] for name in requested if name in errors}
-    return [found[name] for name in names if name in found], await suggest(session, in_order | unmatched)
 
 
 # watch

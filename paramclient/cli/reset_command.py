@@ -19,8 +19,7 @@ from paramclient.cli.metadata import (
 )
 from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import LINE_NAMES_MAX, report, say
-from paramclient.cli.param_names import check_given
-from paramclient.cli.read_commands import get_chosen
+from paramclient.cli.param_names import check_given, get_chosen
 from paramclient.cli.session import CommandSession
 from paramclient.errors import NoReply, UsageError, VehicleError
 from paramclient.metadata import Metadata

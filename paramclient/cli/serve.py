@@ -1,17 +1,23 @@
-"""The subcommands serve, which shares links and cache over HTTP, and token: access tokens for it."""
+"""The subcommands serve, token and sim, for other programs: a gateway, its users, and a simulated vehicle."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import anyio
 
 from paramclient.cli.app import on_end_signal
 from paramclient.cli.options import KeyOptions, Verbose
 from paramclient.cli.output import ExitCode, print_line, say
+from paramclient.client.signing import read_key, timestamp_now
 from paramclient.errors import UsageError
+from paramclient.links import LinkKind, create_link, parse_link, serve_endpoint
+from paramclient.links.sim import simulated
+from paramclient.links.sockets import TcpIn, UdpIn
+from paramclient.protocol.channel import task_group
 
 SERVICE_LIBRARIES: Final = ("fastapi", "uvicorn")
 """Libraries that the extra `service` installs."""
@@ -52,8 +58,7 @@ async def serve(
             connect.
         verbose: Log each step on stderr.
     """
-    if missing := [name for name in SERVICE_LIBRARIES if find_spec(name) is None]:
-        raise UsageError(f"serving needs {' and '.join(missing)}: pip install 'paramclient[service]'")
+    _check_extra()
     from paramclient import service  # only here: needs the extra
 
     if no_cache and cache is not None:
@@ -97,10 +102,44 @@ def token(name: str, /, *, file: Path, read: bool = False) -> None:
         file: The token file of serve --tokens.
         read: Allow only reading.
     """
-    if find_spec("fastapi") is None:
-        raise UsageError("the service needs fastapi: pip install 'paramclient[service]'")
+    _check_extra()
     from paramclient.service import add_token  # only here: needs the extra
 
     made = add_token(file, name, "read" if read else "write")
     say(f"token for {name} ({'read' if read else 'read and write'}), which is shown only once:")
     print_line(made)
+
+
+def _check_extra() -> None:
+    """Raise UsageError if the libraries of the extra `service` are not installed."""
+    if missing := [name for name in SERVICE_LIBRARIES if find_spec(name) is None]:
+        raise UsageError(f"the service needs {' and '.join(missing)}: pip install 'paramclient[service]'")
+
+
+async def sim(
+    vehicle: str, /, *, link: str = "udpout:127.0.0.1:14550", signing_key: Path | None = None
+) -> None:
+    """Run a simulated vehicle for other programs, until Ctrl-C.
+
+    Args:
+        vehicle: px4, ardupilot or camera, with the options of a simulated link, such as
+            "px4?system=2&loss=0.05&seed=1".
+        link: The link to send to or to listen on. With port 0, the system chooses the port, which is printed.
+        signing_key: A file with the signing key: the vehicle signs its frames and requires signed ones.
+    """
+    kind, spec = parse_link(f"sim:{vehicle.removeprefix('sim:')}"), parse_link(link)
+    if spec.kind is LinkKind.SIM:
+        raise UsageError(
+            f"{spec.name} is itself a simulated vehicle; sim needs a link to other programs, such as "
+            "udpout:127.0.0.1:14550"
+        )
+    real = create_link(spec)
+    options: dict[str, Any] = {"stream": real.is_stream}
+    if signing_key is not None:
+        options |= {"signing_key": read_key(signing_key), "signing_timestamp": timestamp_now()}
+    async with task_group() as tasks:
+        opened = await tasks.start(serve_endpoint, simulated(kind, **options).endpoint, real)
+        where = f"speaks to {spec}"
+        if isinstance(opened, UdpIn | TcpIn) and opened.address is not None:
+            where = f"listens on {replace(spec, port=opened.address[1])}"
+        print_line(f"{vehicle} {where}; Ctrl-C ends it")

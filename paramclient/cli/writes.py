@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar, Final, Protocol, Self
 
 import anyio
@@ -13,7 +13,6 @@ import anyio
 from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
 from paramclient.cli.metadata import info_of, meaning_of
 from paramclient.cli.output import LINE_NAMES_MAX, Coloured, ExitCode, Status, code_of, report, say
-from paramclient.cli.param_names import suggest
 from paramclient.cli.session import CommandSession, Done, Sessions, Shown
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
@@ -124,11 +123,7 @@ class SetJob:
             except ParamClientError as error:  # raised only if nothing was written
                 pairs = self.writes.items()
                 outcomes = tuple(SetOutcome(*pair, SetStatus.NOT_TRIED, error=error) for pair in pairs)
-        unknown = {each.name: each.error for each in outcomes if isinstance(each.error, UnknownParameter)}
-        better = await suggest(session, {**unknown})
-        self.arrived = {
-            each.name: replace(each, error=better.get(each.name, each.error)) for each in outcomes
-        }
+        self.arrived = {each.name: each for each in outcomes}
         return self
 
     @property

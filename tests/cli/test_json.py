@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import pytest
 
-from paramclient.cli import ports as ports_command
+from paramclient.cli import link as link_command
 from paramclient.links import SerialPort
 from paramclient.model.values import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, GenericVehicle, PX4Vehicle, SimParam
@@ -275,7 +275,7 @@ def test_json_is_as_recorded(
         product="PX4 FMU v5.x",
         serial_number="0",
     )
-    monkeypatch.setattr(ports_command, "list_ports", lambda: [port])
+    monkeypatch.setattr(link_command, "list_ports", lambda: [port])
     found = outputs(CASES[name], command, put, tmp_path)
     path = DATA / "json" / f"{name}.json"
     if RECORDS:

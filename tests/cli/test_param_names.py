@@ -63,14 +63,6 @@ def test_a_name_that_fits_two_parameters_in_other_cases_is_not_written(command: 
     assert vehicle.values == {"Gain": 1.0, "gain": 5.0}
 
 
-def test_without_a_table_of_the_vehicle_names_of_the_cache_are_suggested(command: Command, put: Put) -> None:
-    assert command("fetch", put(px4(system=7))).code == 0
-    unknown = GenericVehicle({"A": 1}, system=2, autopilot=12, param_error=True)
-    assert "; did you mean MC_ROLL_P?" in command("get", put(unknown), "MC_ROLLP").err
-    assert "; did you mean MC_ROLL_P?" in command("set", put(unknown), "MC_ROLLP", 1).err
-    assert "did you mean" not in command("get", put(unknown), "MC_ROLLP", "--no-cache").err
-
-
 # fetch, save
 
 
