@@ -9,7 +9,7 @@ import socket
 import struct
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,8 +34,8 @@ from paramclient.links import (
     parse_link,
     sockets,
 )
-from paramclient.sim import Air, PX4Vehicle
-from paramclient.wire import frames, messages
+from paramclient.sim import PX4Vehicle
+from paramclient.wire import messages
 from tests.cable import Cable
 
 HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
@@ -491,29 +491,6 @@ async def test_udpin_sends_to_every_known_vehicle() -> None:
                     sock.recv(1000)
 
 
-async def got(sock: socket.socket) -> list[bytes]:
-    """Return all data that a socket has received."""
-    sock.setblocking(False)
-    received = []
-    with suppress(BlockingIOError):
-        while True:
-            received.append(sock.recv(1000))
-    return received
-
-
-@pytest.mark.asyncio
-@pytest.mark.parametrize("junk", [b"\xfd\xfe and so on", HEARTBEAT[:-1] + b"\0", b"\xfd" * 300])
-async def test_udpin_ignores_senders_of_invalid_bytes(junk: bytes) -> None:
-    async with opened("udpin:127.0.0.1:0") as link:
-        with udp_socket(link.address) as odd, udp_socket(link.address) as vehicle:
-            odd.send(junk)
-            vehicle.send(HEARTBEAT)
-            await collect(link, 2)
-            await link.send(frame(1), None)
-            assert await got(vehicle) == [frame(1)]
-            assert await got(odd) == []
-
-
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 async def test_a_port_in_use_is_a_link_error_until_it_is_free(kind: str) -> None:
@@ -559,19 +536,6 @@ async def test_udpout_receives_only_from_its_target_and_keeps_its_port() -> None
 @pytest.mark.asyncio
 async def test_udpout_may_start_before_its_vehicle() -> None:
     port = free_udp_port()
-    async with opened(f"udpout:127.0.0.1:{port}") as link, anyio.create_task_group() as tasks:
-        got: list[tuple[Peer, bytes]] = []
-
-        async def receive() -> None:
-            got.extend(await collect(link, 1))
-
-        tasks.start_soon(receive)
-        for _ in range(3):
-            await link.send(HEARTBEAT, None)  # each causes "connection refused"
-            await anyio.wait_all_tasks_blocked()
-        tasks.cancel_scope.cancel()
-    assert got == []
-
     async with opened(f"udpout:127.0.0.1:{port}") as link:
         await link.send(frame(1), None)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
@@ -825,32 +789,10 @@ async def test_tcpin_limits_its_connections(monkeypatch: pytest.MonkeyPatch) -> 
 # Simulated vehicles
 
 
-def request_hash(system: int = 1) -> bytes:
-    request = messages.ParamRequestRead(system, 1, messages.HASH_CHECK)
-    return messages.encode(request, system=255, component=190, sequence=0)
-
-
-async def answer(link: Link, request: bytes) -> tuple[frames.Frame, messages.ParamValue]:
-    """Send a request, and wait for the first PARAM_VALUE."""
-    framer = frames.Framer(stream=link.is_stream)
-    with anyio.fail_after(TIMEOUT):
-        await link.send(request, None)
-        while True:
-            for _, data in await link.receive():
-                for found in framer.receive(data):
-                    message = messages.decode(found)
-                    if isinstance(message, messages.ParamValue):
-                        return found, message
-
-
 @pytest.mark.asyncio
 async def test_a_sim_link_has_the_faults_of_its_name() -> None:
-    async with opened("sim:px4?delay=0.03&seed=4&param_error=1") as link:
-        assert isinstance(link.endpoint, Air)
-        started = anyio.current_time()
-        await answer(link, request_hash())
-        assert anyio.current_time() - started >= 0.06  # both directions
-    async with opened("sim:px4?loss=1&seed=4") as link:
+    async with opened("sim:px4?loss=1&delay=0.03&seed=4&param_error=1") as link:
         for _ in range(5):
-            await link.send(request_hash(), None)
-        assert link.endpoint.uplink.lost == 5
+            await link.send(HEARTBEAT, None)
+        assert (link.endpoint.uplink.lost, link.endpoint.downlink.delay) == (5, 0.03)
+        assert link.endpoint.vehicles[0].param_error

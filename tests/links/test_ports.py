@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import pytest
 import serialx
 
-from paramclient.cli import run
 from paramclient.links import SerialPort, create_link, list_ports
 
 BY_ID = "/dev/serial/by-id/usb-Hex_ProfiCNC_CubeOrange_2E0045-if00"
@@ -86,24 +84,3 @@ def test_detection_of_autopilots(
 ) -> None:
     port = SerialPort("COM5", vendor_id=vendor, product_id=product, manufacturer=manufacturer)
     assert port.autopilot == autopilot
-
-
-def test_the_command_prints_json(
-    plugged: list[serialx.SerialPortInfo], capsys: pytest.CaptureFixture[str]
-) -> None:
-    plugged += a_few()
-    assert run(["ports", "--json"]) == 0
-    ports = json.loads(capsys.readouterr().out)["ports"]
-    assert ports[0] == {
-        "device": "/dev/ttyACM1",
-        "by_id": BY_ID,
-        "link": f"serial:{BY_ID}:57600",
-        "autopilot": "CubePilot",
-        "vendor_id": "2dae",
-        "product_id": "1016",
-        "manufacturer": "Hex/ProfiCNC",
-        "product": "CubeOrange",
-        "serial_number": "2E0045",
-        "interface": 0,
-    }
-    assert ports[3]["by_id"] is ports[3]["autopilot"] is ports[3]["vendor_id"] is None

@@ -88,29 +88,23 @@ def test_names_may_contain_separators() -> None:
         info.parse("Yaw+Roll, pitch")
 
 
-def test_an_ambiguous_name_is_rejected() -> None:
-    info = ParamInfo("A", values={0: "Off", 2: "off"})
-    with pytest.raises(UsageError, match="A: 'Off' is the name of 0 and 2; give the number"):
-        info.parse("Off")
+MANY: dict[int | float, str] = {**{number: f"Mode {number}" for number in range(40)}, 99: "Loiter"}
 
 
-def test_errors_suggest_names() -> None:
-    with pytest.raises(
-        UsageError, match=r"MODE: 'Loitr' is not a number, nor one of its values: Stabilize \(0\), Lo"
-    ):
-        MODE.parse("Loitr")
-    with pytest.raises(
-        UsageError, match=r"'GPS\|Barro' is not a number, nor is 'Barro' one of its bits: GPS \(0\)"
-    ):
-        MASK.parse("GPS|Barro")
-    with pytest.raises(UsageError, match="and its values have no names"):
-        GAIN.parse("high")
-    named: dict[int | float, str] = {number: f"Mode {number}" for number in range(40)}
-    many = ParamInfo("MANY", values=named | {99: "Loiter"})
-    with pytest.raises(UsageError, match=r"nor one of its values; similar: Loiter$"):
-        many.parse("Loitr")
-    with pytest.raises(UsageError, match=r"nor one of its values, of which there are 41$"):
-        many.parse("xyzzy")
+@pytest.mark.parametrize(
+    ("info", "text", "problem"),
+    [
+        (ParamInfo("A", values={0: "Off", 2: "off"}), "Off", "A: 'Off' is the name of 0 and 2"),
+        (MODE, "Loitr", r"nor one of its values: Stabilize \(0\), Lo"),
+        (MASK, "GPS|Barro", r"nor is 'Barro' one of its bits: GPS \(0\)"),
+        (GAIN, "high", "and its values have no names"),
+        (ParamInfo("MANY", values=MANY), "Loitr", "nor one of its values; similar: Loiter$"),
+        (ParamInfo("MANY", values=MANY), "xyzzy", "nor one of its values, of which there are 41$"),
+    ],
+)
+def test_errors_suggest_names(info: ParamInfo, text: str, problem: str) -> None:
+    with pytest.raises(UsageError, match=problem):
+        info.parse(text)
 
 
 @given(st.integers(0, 2**64 - 1), st.dictionaries(st.integers(0, 63), st.text(max_size=8), max_size=8))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from paramclient.model.names import NameChoice, did_you_mean, nearest_names
+from paramclient.model.names import NameChoice, nearest_names
 
 NAMES = ["MC_YAWRATE_P", "MC_YAW_P", "MC_ROLL_P", "MC_ROLLRATE_P", "MPC_XY_P", "ringBuffer"]
 
@@ -28,12 +28,6 @@ def test_a_name_is_not_suggested_for_itself_and_nothing_for_an_unlike_one() -> N
     assert nearest_names("BATTERY", NAMES) == ()
     assert nearest_names("BATTERY", []) == ()
     assert nearest_names("", ["", "A"]) == nearest_names("A", [""]) == ()
-
-
-def test_suggestions_are_a_sentence() -> None:
-    assert did_you_mean(()) == ""
-    assert did_you_mean(["A"]) == "; did you mean A?"
-    assert did_you_mean(["A", "B", "C"]) == "; did you mean A, B or C?"
 
 
 def test_upper_and_lower_case_do_not_matter_in_a_selection() -> None:

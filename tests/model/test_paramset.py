@@ -1,4 +1,4 @@
-"""Parameter sets without a vehicle."""
+"""Parameter sets, the mapping of parameters, and defaults of the firmware."""
 
 from __future__ import annotations
 
@@ -6,7 +6,15 @@ import struct
 
 import pytest
 
-from paramclient.model.paramset import WrittenParam
+from paramclient.model.paramset import (
+    DefaultSource,
+    ParamMap,
+    ParamSet,
+    WrittenParam,
+    add_default,
+    add_defaults,
+    default_of,
+)
 from paramclient.model.values import Param, ParamType, Value, bits_of
 
 
@@ -48,3 +56,102 @@ def test_raw_bytes_of_a_small_type_have_four_bytes() -> None:
     param = Param("P", raw, ParamType.INT8, 0, int.from_bytes(raw, "little"))
     assert WrittenParam.of(param).is_held_by(param)
     assert not WrittenParam("P", struct.pack("<f", 2e20)).is_held_by(param)
+
+
+def param(
+    name: str,
+    value: Value,
+    kind: ParamType | int = ParamType.REAL32,
+    default: int | float | None = None,
+) -> Param:
+    return Param(name, value, kind, 0, bits_of(value, kind), default=default)
+
+
+def test_the_default_of_the_vehicle_has_priority() -> None:
+    default = default_of(param("P", 1.0, default=2.0), 3.0)
+    assert default is not None
+    assert (default.value, default.source) == (2.0, DefaultSource.VEHICLE)
+
+
+def test_without_one_the_default_of_the_metadata_counts() -> None:
+    default = default_of(param("P", 1.0), 3)
+    assert default is not None
+    assert (default.value, default.source) == (3.0, DefaultSource.METADATA)
+    assert isinstance(default.value, float)
+    assert default_of(param("P", 1.0)) is None
+
+
+def test_a_decimal_default_is_rounded_as_the_vehicle_rounds_it() -> None:
+    assert add_default(Param("P", 0.1, 9, 0, bits_of(0.1, 9)), 0.1).default == pytest.approx(0.1)
+    held = Param("P", 0.1, ParamType.REAL32, 0, bits_of(0.1, ParamType.REAL32))
+    for described in (0.1, 0.10000000149011612):
+        assert add_default(held, described).is_changed is False
+
+
+def test_a_set_keeps_its_own_defaults_and_those_without_one_get_them() -> None:
+    params = ParamSet(
+        {
+            "A": WrittenParam("A", 1, ParamType.INT32, 5),
+            "B": WrittenParam("B", 1.5, ParamType.REAL32),
+            "C": WrittenParam("C", 7),
+            "D": WrittenParam("D", 7),
+        }
+    )
+    filled = add_defaults(params, {"A": 9, "B": 2, "C": 8})
+    assert {name: each.default for name, each in filled.items()} == {"A": 5, "B": 2.0, "C": 8, "D": None}
+    assert add_defaults(params, {}) is params
+
+
+def test_a_param_map_is_a_live_read_only_view() -> None:
+    table = {"B": Param("B", 1, ParamType.INT32, 0, 1)}
+    params = ParamMap(table)
+    assert repr(params) == "<ParamMap 1 param>"
+    table["A"] = Param("A", 2, ParamType.INT32, 1, 2)
+    assert list(params) == ["B", "A"]
+    assert params == table
+    assert params["A"] is table["A"]
+    assert "A" in params
+    assert "C" not in params
+    assert params.get("C") is None
+    assert len(params) == 2
+    assert repr(params) == "<ParamMap 2 params>"
+    with pytest.raises(KeyError):
+        params["C"]
+    with pytest.raises(TypeError):
+        params["C"] = table["A"]  # type: ignore[index]  # must fail
+    with pytest.raises(AttributeError):
+        params.anything = 1  # type: ignore[attr-defined]
+
+
+def test_an_iteration_is_over_the_names_at_its_start() -> None:
+    table = {name: Param(name, 1, ParamType.INT32, 0, 1) for name in "AB"}
+    names = []
+    for name in ParamMap(table):  # the event loop of a blocking client adds names meanwhile
+        table[f"{name}2"] = table[name]
+        names.append(name)
+    assert names == ["A", "B"]
+
+
+def test_changed_returns_values_that_differ_from_defaults() -> None:
+    nan = float("nan")
+    table = {
+        name: Param(name, value, ParamType.REAL32, 0, 0, default=default)
+        for name, value, default in (
+            ("SAME", 1.5, 1.5),
+            ("OTHER", 1.5, 2.5),
+            ("UNKNOWN", 1.5, None),
+            ("ZERO", 0.0, -0.0),
+            ("NAN", nan, nan),
+            ("NOW_NAN", nan, 1.0),
+        )
+    }
+    assert {name: param.is_changed for name, param in table.items()} == {
+        "SAME": False,
+        "OTHER": True,
+        "UNKNOWN": None,
+        "ZERO": False,
+        "NAN": False,
+        "NOW_NAN": True,
+    }
+    params = ParamMap(table)
+    assert params.changed() == {"OTHER": table["OTHER"], "NOW_NAN": table["NOW_NAN"]}

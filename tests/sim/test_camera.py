@@ -10,14 +10,7 @@ from paramclient.errors import ExtAckResult, UsageError
 from paramclient.model.values import ParamType
 from paramclient.sim import Camera
 from paramclient.wire import frames, messages
-from paramclient.wire.messages import (
-    Message,
-    ParamExtAck,
-    ParamExtRequestList,
-    ParamExtRequestRead,
-    ParamExtSet,
-    ParamExtValue,
-)
+from paramclient.wire.messages import Message, ParamExtAck, ParamExtSet
 
 UINT32 = ParamType.UINT32
 
@@ -42,25 +35,6 @@ def result(camera: Camera, request: ParamExtSet) -> tuple[int, int]:
     (answer,) = ask(camera, request)
     assert isinstance(answer, ParamExtAck)
     return answer.raw[0], answer.param_result
-
-
-def test_the_camera_answers_reads_of_its_parameters() -> None:
-    camera = Camera()
-    by_name = ask(camera, ParamExtRequestRead(1, 100, "CAM_MODE"))
-    assert by_name == [ParamExtValue("CAM_MODE", b"\1".ljust(128, b"\0"), UINT32, 16, 0)]
-    assert ask(camera, ParamExtRequestRead(1, 100, "", 0)) == by_name
-    assert ask(camera, ParamExtRequestRead(1, 100, "NO_SUCH")) == []
-    assert ask(camera, ParamExtRequestRead(1, 100, "", 16)) == []
-    assert ask(camera, ParamExtRequestRead(1, 1, "CAM_MODE")) == []
-    assert camera.requests["PARAM_EXT_REQUEST_READ"] == 4
-
-
-def test_the_camera_sends_its_list_in_bursts() -> None:
-    camera = Camera()
-    assert len(ask(camera, ParamExtRequestList(1, 100), until=1.0)) == 5
-    camera.tick(2.0)
-    assert len(camera.data_to_send()) >= 11
-    assert ask(Camera({}), ParamExtRequestList(1, 100), until=3.0) == []
 
 
 def test_results_of_sets() -> None:

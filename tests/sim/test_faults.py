@@ -45,17 +45,6 @@ class TestDead:
         assert len(vehicle.params) == 10
 
 
-@EVERY_KIND
-@pytest.mark.parametrize("count", [0, 4])
-def test_a_list_stops_once(kind: Callable[..., Vehicle], count: int) -> None:
-    vehicle = kind(table=TEN)
-    vehicle.when_listed(count, vehicle.stop_list)
-    station = Station(vehicle)
-    assert listed(station) == list(range(count))
-    assert indices(station.ask(read(index=8))) == [8]
-    assert listed(station) == list(range(10))
-
-
 class TestWhenListed:
     @EVERY_KIND
     def test_a_value_changes_during_a_list(self, kind: Callable[..., Vehicle]) -> None:

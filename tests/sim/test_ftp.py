@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import pytest
 
 from paramclient.errors import FileErrorCode, UsageError
@@ -12,7 +10,7 @@ from paramclient.model.values import ParamType
 from paramclient.protocol import param_pck
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.param_pck import PackedParam
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
+from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import frames, messages
 
 PARAMS = b"@PARAM/param.pck"
@@ -77,21 +75,6 @@ def refusal(answer: Packet) -> tuple[int, ...]:
     return tuple(answer.data)
 
 
-def test_a_burst_reads_a_file_to_its_end() -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    content = bytes(range(256)) * 3
-    pilot.vehicle.files["logs/1.bin"] = content
-    opened = pilot.ask(Opcode.OPEN_FILE_RO, b"logs/1.bin")
-    assert (opened.opcode, opened.session, opened.data) == (Opcode.ACK, 3, (768).to_bytes(4, "little"))
-    *blocks, end = pilot.burst()
-    assert [each.offset for each in blocks] == [0, 239, 478, 717]
-    assert b"".join(each.data for each in blocks) == content
-    assert refusal(end) == (FileErrorCode.EOF,)
-    assert end.offset == 768
-    sequences = [each.sequence for each in (*blocks, end)]
-    assert sequences == list(range(sequences[0], sequences[0] + 5))
-
-
 def test_param_pck_is_read_with_one_size() -> None:
     pilot = Pilot(ArduPilotVehicle())
     assert pilot.ask(Opcode.OPEN_FILE_RO, PARAMS).data == (12 * 1382).to_bytes(4, "little")
@@ -135,19 +118,6 @@ def test_param_pck_has_the_current_values() -> None:
     assert after["COMPASS_DEC"].default is None
 
 
-def test_the_checksum_of_param_pck_is_that_of_reads_of_64_bytes() -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    rows = packed(pilot.vehicle)
-    for query, part in ((b"", rows), (b"?start=5&count=300", rows[5:305])):
-        found = pilot.ask(Opcode.CALC_FILE_CRC32, PARAMS + query)
-        wanted = crc32_px4(param_pck.encode(part, total=len(rows), read_size=64))
-        assert int.from_bytes(found.data, "little") == wanted
-    assert refusal(pilot.ask(Opcode.CALC_FILE_CRC32, PARAMS + b"?start=1382")) == (
-        FileErrorCode.FAIL_ERRNO,
-        22,
-    )
-
-
 def test_checksums_of_files() -> None:
     pilot = Pilot(ArduPilotVehicle())
     pilot.vehicle.files["logs/1.bin"] = b"abc"
@@ -157,16 +127,6 @@ def test_checksums_of_files() -> None:
 
 
 class TestSessions:
-    def test_ardupilots_session_ends_after_3_s_without_a_response(self) -> None:
-        pilot = Pilot(ArduPilotVehicle())
-        pilot.vehicle.files["a"] = b"a"
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
-        pilot.listen(2.85)
-        assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)) == (FileErrorCode.INVALID_SESSION,)
-        pilot.listen(2.95)
-        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
-        assert refusal(pilot.ask(Opcode.READ_FILE, session=3, size=1)) == (FileErrorCode.INVALID_SESSION,)
-
     def test_px4_closes_a_session_after_11_s(self) -> None:
         pilot = Pilot(PX4Vehicle())
         pilot.vehicle.files["a"] = b"a"
@@ -215,52 +175,6 @@ class TestPace:
             pilot.send(Packet(100 + 2 * number, 3, Opcode.READ_FILE, size=10, offset=10 * number))
         assert [each.offset for each in pilot.listen(1.0)] == [0, 10, 20, 30, 40]
 
-    def test_requests_during_a_burst_wait_for_its_end(self) -> None:
-        pilot = Pilot(ArduPilotVehicle())
-        pilot.vehicle.files["a"] = bytes(5000)
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
-        pilot.send(Packet(100, 3, Opcode.BURST_READ_FILE, size=239))
-        assert pilot.listen(0.03)
-        pilot.send(Packet(200, 3, Opcode.READ_FILE, size=239))
-        *_, end, answer = pilot.listen(1.0)
-        assert refusal(end) == (FileErrorCode.EOF,)
-        assert answer.sequence == 201
-
-    @pytest.mark.parametrize("size", [239, 110])
-    def test_a_burst_uses_a_third_of_the_link(self, size: int) -> None:
-        pilot = Pilot(ArduPilotVehicle(ftp_rate=1920.0))
-        pilot.vehicle.files["a"] = bytes(10 * size)
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
-        pilot.send(Packet(100, 3, Opcode.BURST_READ_FILE, size=size))
-        frame = size + 27
-        received = pilot.listen(9.5 * frame / 1920)
-        assert len(received) == 10
-        assert len(received + pilot.listen(frame / 1920)) == 11
-
-    def test_on_a_serial_port_the_banner_precedes_the_first_block(self) -> None:
-        """On a real one at 57600 baud, 0.095 to 0.105 s after the requests for open and burst."""
-        air = Air.symmetric([ArduPilotVehicle(ftp_rate=5760.0)], rate=5760.0)
-        framer = frames.Framer(stream=False)
-        air.tick(0.0)
-        opening = Packet(100, 3, Opcode.OPEN_FILE_RO, PARAMS + b"?withdefaults=1")
-        for request in (opening, opening, Packet(200, 3, Opcode.BURST_READ_FILE, size=DATA_SIZE_MAX)):
-            air.receive(file_request(request), 0.5)
-        blocks: list[float] = []
-        now = 0.5
-        while len(blocks) < 4:
-            due = air.next_deadline()
-            assert due is not None
-            now = max(now, due)
-            air.tick(now)
-            for data in air.data_to_send():
-                message = messages.decode(framer.receive(data)[0])
-                if isinstance(message, messages.FileTransfer):
-                    answer = Packet.unpack(message.payload)
-                    blocks += [now] * (answer.requested == Opcode.BURST_READ_FILE)
-        assert 0.095 <= blocks[0] - 0.5 <= 0.125
-        gaps = [later - earlier for earlier, later in pairwise(blocks)]
-        assert gaps == pytest.approx([(DATA_SIZE_MAX + 27) / 5760] * 3, abs=0.01)
-
     def test_px4_ends_a_burst_after_168_blocks(self) -> None:
         pilot = Pilot(PX4Vehicle())
         pilot.vehicle.files["a"] = bytes(50_000)
@@ -302,16 +216,3 @@ class TestSwitches:
         assert pilot.listen(1.0) == []
         with pytest.raises(UsageError, match="this vehicle has no MAVFTP"):
             assert vehicle.files
-
-    @pytest.mark.parametrize(
-        ("vehicle", "has_it"),
-        [(ArduPilotVehicle(), True), (ArduPilotVehicle(ftp=False), False), (PX4Vehicle(), True)],
-    )
-    def test_capabilities_have_the_ftp_bit(self, vehicle: Vehicle, has_it: bool) -> None:
-        vehicle.tick(0.0)
-        ask = messages.CommandLong(1, 1, messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0)
-        vehicle.receive(messages.encode(ask, system=255, component=190, sequence=0), 0.1)
-        framer = frames.Framer(stream=False)
-        sent = [messages.decode(frame) for data in vehicle.data_to_send() for frame in framer.receive(data)]
-        (version,) = [each for each in sent if isinstance(each, messages.AutopilotVersion)]
-        assert bool(version.capabilities & messages.CAPABILITY_FTP) is has_it

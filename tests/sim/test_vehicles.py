@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from paramclient.errors import ParamErrorCode, UsageError
-from paramclient.model.px4_hash import hash_bits
 from paramclient.model.values import TYPES_BY_NAME, Param, ParamType, Value
 from paramclient.sim import (
     ArduPilotVehicle,
@@ -22,7 +21,6 @@ from paramclient.sim import (
     SimParam,
     Vehicle,
     ardupilot_table,
-    px4_table,
 )
 from paramclient.wire import messages
 from tests.ground_station import LIST, SMALL, Station, cast, indices, names, read, write
@@ -82,25 +80,6 @@ class TestEveryVehicle:
         )
         assert not vehicle.requests
 
-    def test_requests_are_counted(self, kind: Callable[[], Vehicle]) -> None:
-        vehicle = kind()
-        Station(vehicle).send(
-            LIST,
-            read(index=0),
-            read("NO_SUCH"),
-            write("NO_SUCH", 1.0, ParamType.REAL32),
-            messages.CommandLong(1, 1, 520),
-            messages.Heartbeat(6, 8),
-            messages.StatusText(6, "not a request"),
-        )
-        assert vehicle.requests == {
-            "PARAM_REQUEST_LIST": 1,
-            "PARAM_REQUEST_READ": 2,
-            "PARAM_SET": 1,
-            "COMMAND_LONG": 1,
-            "HEARTBEAT": 1,
-        }
-
     def test_a_reboot_keeps_only_the_values(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
         name = next(iter(vehicle.params))
@@ -117,14 +96,6 @@ class TestEveryVehicle:
         assert station.log[0][1].sequence == 0
         assert vehicle.param(name).value == 3
         assert len(station.ask(LIST, seconds=1.5)) >= len(vehicle.params)
-
-    def test_a_full_download_gives_the_table(self, kind: Callable[[], Vehicle]) -> None:
-        vehicle = kind()
-        values = Station(vehicle).ask(LIST, seconds=1.2)
-        listed = [value for value in values if value.param_index != NO_INDEX]
-        assert names(listed) == list(vehicle.params)
-        assert indices(listed) == list(range(len(listed)))
-        assert {value.param_count for value in values} == {len(listed)}
 
 
 _text = st.sampled_from(["", "A_FLOAT", "b_int", "_HASH_CHECK", "A" * 16, "\xff\x01"])
@@ -200,14 +171,6 @@ def hash_set(value: int = 0) -> messages.ParamSet:
 
 
 class TestPX4:
-    @pytest.mark.parametrize("value", [0, 0xCF579589])
-    def test_a_set_of_the_hash_stops_the_list_after_what_is_queued(self, value: int) -> None:
-        station = Station(PX4Vehicle())
-        assert len(station.ask(LIST, hash_set(value), seconds=2.0)) == 20
-        assert len(station.ask(LIST, seconds=0.1)) == 120
-        assert not station.ask(hash_set(value), seconds=2.0)
-        assert names(station.ask(LIST))[0] == "_HASH_CHECK"
-
     @pytest.mark.parametrize("by_parameter", [False, True])
     def test_without_the_hash(self, by_parameter: bool) -> None:
         vehicle = PX4Vehicle(hash_check=by_parameter)
@@ -217,19 +180,6 @@ class TestPX4:
         station = Station(vehicle)
         assert not station.ask(HASH, hash_set())
         assert indices(station.ask(LIST, hash_set(), seconds=2.0)) == list(range(903))
-
-    def test_volatile_values_are_not_in_the_hash(self) -> None:
-        vehicle = PX4Vehicle()
-        before = vehicle.announced_hash()
-        vehicle.set_param("COM_FLIGHT_UUID", 12345)
-        assert vehicle.announced_hash() == before
-        vehicle.set_param("SYS_AUTOSTART", 4001)
-        after = vehicle.announced_hash()
-        assert after != before
-        volatile = [row.name for row in px4_table() if row.volatile]
-        assert after == hash_bits(
-            {name: each.bits for name, each in vehicle.params.items()}, leave_out=volatile
-        )
 
     def test_invalid_requests_are_not_answered(self) -> None:
         vehicle = PX4Vehicle()
@@ -337,15 +287,6 @@ class TestArduPilot:
         assert not station.ask(LIST, seconds=5.0)
         assert len(station.ask(LIST)) == 4
 
-    def test_a_read_by_name_has_no_index_and_the_requested_spelling(self) -> None:
-        station = Station(ArduPilotVehicle())
-        (value,) = station.ask(read("rtl_Alt"))
-        assert value == messages.ParamValue(
-            "rtl_Alt", struct.pack("<f", 1500), ParamType.INT32, 1382, NO_INDEX
-        )
-        (value,) = station.ask(read(index=8))
-        assert (value.param_id, value.param_index) == ("RTL_ALT", 8)
-
     @pytest.mark.parametrize(
         ("name", "value", "stored"),
         [
@@ -382,40 +323,6 @@ class TestArduPilot:
         assert vehicle.values["RTL_ALT"] == 1500
         vehicle.set_param("RTL_ALT", 8)
         assert vehicle.values["RTL_ALT"] == 8
-
-    def test_on_a_slow_link_a_list_does_not_delay_responses(self) -> None:
-        station = Station(ArduPilotVehicle(burst=1, period=0.025)).send(LIST).wait(0.15)
-        station.log.clear()
-        station.send(cast("RTL_ALT", 1234.0), read(index=1000)).wait(0.1)
-        times = {value.param_index: time for time, _, value in station.log if hasattr(value, "param_index")}
-        assert (times[NO_INDEX], times[1000]) == pytest.approx((0.156, 0.2), abs=0.006)
-
-    def test_an_unknown_name_takes_time_but_no_slot(self) -> None:
-        vehicle = ArduPilotVehicle()
-        unknown = [read(f"NO_SUCH_{number}") for number in range(19)]
-        station = Station(vehicle).send(*unknown, *[read("RTL_ALT")] * 3).wait(0.5)
-        assert (
-            len(station.receive(messages.ParamValue)) == 2
-        )  # one in look-up, 20 waiting: the last one is dropped
-        station = Station(ArduPilotVehicle()).send(*unknown[:14], *[read("RTL_ALT")] * 5).wait(0.11)
-        assert len(station.receive(messages.ParamValue)) == 5
-
-    def test_a_group_is_shown_and_hidden(self) -> None:
-        vehicle = ArduPilotVehicle()
-        station = Station(vehicle)
-        switch = vehicle.param("EK2_ENABLE").index
-        assert switch is not None
-        (value,) = station.ask(cast("EK2_ENABLE", 1))
-        assert value.param_count == 1434
-        assert vehicle.param("EK2_GPS_TYPE").index == switch + 1
-        assert vehicle.param("EK3_ENABLE").index == switch + 53
-        values = station.ask(LIST, seconds=2.0)
-        assert indices(values) == list(range(1434))
-        assert names(values) == list(vehicle.params)
-        (value,) = station.ask(cast("EK2_ENABLE", 0))
-        assert value.param_count == 1382
-        assert vehicle.param("EK2_GPS_TYPE").index is None
-        assert vehicle.param("EK3_ENABLE").index == switch + 1
 
     def test_live_values_are_sent_unsolicited(self) -> None:
         vehicle = ArduPilotVehicle(live_period=10.0)
