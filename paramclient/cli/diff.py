@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
 from typing import Final
 
 from paramclient.cli.json_output import diff_json
@@ -17,11 +15,11 @@ from paramclient.cli.metadata import (
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, ExitCode, print_json, print_table, say
-from paramclient.cli.sources import described, resolve_all, value_text
+from paramclient.cli.sources import described, part_of, resolve_all, value_text
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import ChangedSide, Comparison, Difference, DifferenceStatus, compare
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.paramset import WrittenParam
 from paramclient.provision.sources import collect_defaults, is_file, is_offline
 
 DEFAULTS: Final = "defaults"
@@ -74,9 +72,9 @@ async def diff(
     given = [left, right, *([] if base in (None, DEFAULTS) else [base or ""])]
     first, second, *third = await resolve_all(given, options)
     if partial and is_file(right) and not is_file(left):
-        first = _limited(first, second)
+        first = part_of(first, second)
     elif partial:
-        second = _limited(second, first)
+        second = part_of(second, first)
     known = known_of_sets([first, second, *third], options, metadata)
     before = third[0] if third else None
     if base == DEFAULTS:
@@ -95,10 +93,6 @@ async def diff(
         for line in [*_summary(outcome), *filter(None, [hint])]:
             say(line)
     return ExitCode.DONE if outcome.is_same else ExitCode.DIFFERENT
-
-
-def _limited(params: ParamSet, names: Mapping[str, object]) -> ParamSet:
-    return replace(params, params={name: param for name, param in params.items() if name in names})
 
 
 # Tables

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
@@ -12,6 +10,7 @@ from typing import Annotated, Final
 import anyio.to_thread
 from cyclopts import Parameter
 
+from paramclient.cli.json_output import taken
 from paramclient.cli.metadata import (
     METADATA_HINT,
     MetadataFile,
@@ -21,15 +20,23 @@ from paramclient.cli.metadata import (
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import ExitCode, print_json, report, say
-from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
-from paramclient.cli.sources import check_link, filled, noun_of, whole_table
+from paramclient.cli.session import ChosenVehicle, sessions
+from paramclient.cli.sources import check_link, filled, noun_of, part_of, whole_table, without_cache
 from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, writable, write_file
 from paramclient.files.formats import address, format_of_name
 from paramclient.metadata import Metadata
 from paramclient.model.names import NameChoice, counted, first_of
 from paramclient.model.paramset import ParamSet, default_of
-from paramclient.provision import sources
+from paramclient.provision.sources import (
+    NAMES_SHOWN_MAX,
+    NO_DEFAULTS,
+    choose,
+    is_offline,
+    link_of,
+    read_source,
+    select_non_defaults,
+)
 
 _DEFAULTS: Final = LinkOptions()
 
@@ -69,46 +76,26 @@ async def save(
     if metadata is not None and not changed:
         raise UsageError("--metadata gives the defaults for --changed")
     written = file_format or format_of_name(str(file))
-    choice = ChosenVehicle.parse(options.vehicle)
-    faults: list[str] = []
-    if sources.is_offline(where):
-        with _hint_at_incomplete():
-            stored = sources.read_source(
-                where,
-                component=choice.component,
-                every=choice.is_all,
-                extended=options.extended,
-                incomplete=incomplete,
-                cache=options.place,
-            )
-        assert stored is not None, "it is no link"
-        sets = [*stored.sets] if choice.is_all else [sources.choose(stored, choice.component, choice.system)]
-    else:
-        link = sources.link_of(where)
-        check_link(link)
-
-        async def fetch(session: CommandSession) -> ParamSet:
-            with _hint_at_incomplete():
-                return await whole_table(session, partial=incomplete)
-
-        async with sessions(link, options) as opened:
-            done = await opened.work(fetch)
-            opened.report_others()
-        sets = [each.result for each in done if each.result is not None]
-        faults = [f"{each.session.address}: {each.error}" for each in done if each.error is not None]
+    try:
+        sets, is_part = await _sets_of(where, options, incomplete=incomplete)
+    except VehicleError as error:  # the table is incomplete
+        hint = f"{error}; --incomplete writes what was received"
+        raise VehicleError(hint, system=error.system, component=error.component) from None
     if changed:
-        known = known_of_sets(sets, options, metadata)
-        sets = [*filter(None, map(partial(_differing, faults), sets, known))]
-    for fault in faults:
-        report(fault)
+        given, known = sets, known_of_sets(sets, options, metadata)
+        sets = [each for whole, info in zip(given, known, strict=True) if (each := _differing(whole, info))]
+        is_part = is_part or len(sets) < len(given)
+    if only:
+        names = NameChoice(only).choose({name for each in sets for name in each}) if sets else ()
+        sets = [each for whole in sets if (each := part_of(whole, names))]
     files: dict[Path, list[ParamSet]] = {}
-    for each in _chosen(sets, only) if only else sets:
+    for each in sets:
         uid = None if each.identity is None else each.identity.uid
         path = Path(filled(str(file), each.system, uid, address(each)))
         kept, left_out = writable(each, written)
         if left_out:
-            names = first_of(left_out, sources.NAMES_SHOWN_MAX)
-            report(f"{address(each)}: left out, as only a .json file can hold them: {names}")
+            listed = first_of(left_out, NAMES_SHOWN_MAX)
+            report(f"{address(each)}: left out, as only a .json file can hold them: {listed}")
         files.setdefault(path, []).append(kept)
     for path, of_file in files.items():
         await anyio.to_thread.run_sync(partial(write_file, path, of_file, file_format=written))
@@ -116,42 +103,44 @@ async def save(
         _show(files, written, as_json=options.json)
     else:
         report(f"nothing was written to {file}")
-    return ExitCode.INCOMPLETE if faults or not files else ExitCode.DONE
+    return ExitCode.DONE if files and not is_part else ExitCode.INCOMPLETE
 
 
-def _differing(faults: list[str], whole: ParamSet, metadata: Metadata | None) -> ParamSet | None:
-    """Return the parameters that differ from the defaults; None, and a fault, if none is known to."""
+async def _sets_of(where: str, options: LinkOptions, *, incomplete: bool) -> tuple[list[ParamSet], bool]:
+    """Return the sets of the vehicles that --vehicle names, and whether those of some could not be read."""
+    choice, link = ChosenVehicle.parse(options.vehicle), link_of(where)
+    if is_offline(where):
+        found = read_source(
+            where,
+            component=choice.component,
+            every=choice.is_all,
+            extended=options.extended,
+            incomplete=incomplete,
+            cache=options.place,
+        )
+        assert found is not None, "it is no link"
+        return [*found.sets] if choice.is_all else [choose(found, choice.component, choice.system)], False
+
+    check_link(link)
+    async with sessions(link, without_cache(link, options)) as opened:
+        done = await opened.work(partial(whole_table, partial=incomplete))
+        opened.report_others()
+    for session, error in opened.errors.items():
+        report(f"{session.address}: {error}")
+    return [each.result for each in done if each.result is not None], bool(opened.errors)
+
+
+def _differing(whole: ParamSet, metadata: Metadata | None) -> ParamSet | None:
+    """Return the parameters that differ from the defaults; None, and an error line, if none is known to."""
     described = defaults_in(metadata, whole)
     try:
-        differing = sources.select_non_defaults(whole, described)
+        differing = select_non_defaults(whole, described)
     except UsageError as error:
-        hint = f"; {METADATA_HINT}" if str(error) == sources.NO_DEFAULTS else ""
-        faults.append(f"{address(whole)}: {error}{hint}")
+        hint = f"; {METADATA_HINT}" if str(error) == NO_DEFAULTS else ""
+        report(f"{address(whole)}: {error}{hint}")
         return None
-    defaults = (default_of(each, described.get(each.name)) for each in differing.values())
-    say_sources(address(whole), defaults)
+    say_sources(address(whole), (default_of(each, described.get(each.name)) for each in differing.values()))
     return differing
-
-
-@contextmanager
-def _hint_at_incomplete() -> Iterator[None]:
-    """Add to the error of an incomplete table what to do."""
-    try:
-        yield
-    except VehicleError as error:
-        message = f"{error}; --incomplete writes what was received"
-        raise VehicleError(message, system=error.system, component=error.component) from None
-
-
-def _chosen(sets: Sequence[ParamSet], only: Sequence[str]) -> list[ParamSet]:
-    """Return the sets with only the parameters that names and patterns choose, without empty sets.
-
-    Raises:
-        UsageError: a name or pattern fits no parameter of any set.
-    """
-    names = NameChoice(only).choose({name for each in sets for name in each}) if sets else ()
-    parts = [replace(each, params={n: param for n, param in each.items() if n in names}) for each in sets]
-    return [each for each in parts if each]
 
 
 def _show(files: Mapping[Path, Sequence[ParamSet]], file_format: FileFormat, *, as_json: bool) -> None:
@@ -160,9 +149,7 @@ def _show(files: Mapping[Path, Sequence[ParamSet]], file_format: FileFormat, *, 
             {
                 "path": str(file),
                 "format": file_format.value,
-                "components": [
-                    {"system": each.system, "component": each.component, "params": len(each)} for each in sets
-                ],
+                "components": [taken(each, "system", "component") | {"params": len(each)} for each in sets],
             }
             for file, sets in files.items()
         ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Final
@@ -13,7 +13,7 @@ from paramclient.cli.output import local_time, report
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
 from paramclient.errors import UsageError
 from paramclient.files.formats import ENDINGS, address
-from paramclient.links import FORMS, parse_link
+from paramclient.links import FORMS, LinkKind, parse_link
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import counted
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -51,7 +51,8 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: boo
     choice, extended = ChosenVehicle.parse(options.vehicle), options.extended
 
     async def fetch(url: str) -> ParamSet:
-        async with sessions(url, replace(options, extended=extended), writes=writes) as opened:
+        chosen = replace(without_cache(url, options), extended=extended)
+        async with sessions(url, chosen, writes=writes) as opened:
             table = await whole_table(opened[0])
             if not writes:
                 opened.report_others()
@@ -72,6 +73,12 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: boo
             )
             extended = extended or found[text].is_extended
     return [found[text] for text in texts]
+
+
+def without_cache(url: str, options: LinkOptions) -> LinkOptions:
+    """Return the options for a link: a log uses no cache, and --cache is for other sources and metadata."""
+    is_log = url.startswith(f"{LinkKind.REPLAY}:")
+    return replace(options, cache=None, no_cache=True) if is_log else options
 
 
 async def whole_table(session: CommandSession, *, partial: bool = False) -> ParamSet:
@@ -120,7 +127,12 @@ def _nearest_file(text: str) -> str:
     return f" (did you mean {folder / similar[0]}?)" if similar else ""
 
 
-# Sets in words
+# Sets
+
+
+def part_of(params: ParamSet, names: Container[str]) -> ParamSet:
+    """Return a set with only the parameters of these names."""
+    return replace(params, params={name: param for name, param in params.items() if name in names})
 
 
 def described(params: ParamSet) -> str:

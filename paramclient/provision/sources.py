@@ -21,6 +21,7 @@ from paramclient.client.component import Component
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError, VehicleError
 from paramclient.files import LARGEST_FILE, FileFormat, ParamFile, loads, read_file
 from paramclient.files.formats import AUTOPILOT
+from paramclient.links import ReplayLink
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.comparison import defaults_of, non_defaults
 from paramclient.model.names import first_of
@@ -219,13 +220,17 @@ def component_of(vehicle: str) -> int | None:
 
 
 def component_set(component: Component, params: Iterable[Param], source: str) -> ParamSet:
-    """Return parameters of a component as a set of this moment; `source` is their origin in words."""
+    """Return parameters of a component as a set of this moment, or of that of the log on the link.
+
+    `source` is their origin in words.
+    """
+    link = component.client.link
     return ParamSet(
         {param.name: param for param in params},
         component=component.component,
         system=component.system,
         identity=component.identity,
-        at=time.time(),
+        at=link.at if isinstance(link, ReplayLink) else time.time(),
         source=source,
         is_extended=component.is_extended,
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from paramclient import FileError, ParamCache, UsageError, VehicleError
+from paramclient.model.notation import time_text
 from paramclient.provision import resolve
 from paramclient.provision.sources import read_source
 from paramclient.sim import PX4Vehicle
@@ -41,6 +42,9 @@ async def test_every_source_becomes_a_set(tmp_path: Path, monkeypatch: pytest.Mo
         "cache:4": "MC_ROLL_P",
     }
     assert [each.system for each in found.values()] == [None, None, 4, 1]
+    (log,) = (each for each in found.values() if each.system == 1)
+    assert log.at is not None
+    assert time_text(log.at).startswith("2026-11-20")
 
 
 @in_simulated_time
