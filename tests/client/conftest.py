@@ -11,7 +11,8 @@ import anyio
 import anyio.abc
 import pytest
 
-from paramclient import Component, ParamClient
+from paramclient import Component, ParamCache, ParamClient
+from paramclient.cache import CachedComponent
 from tests.cable import TIMEOUT
 from tests.shell import a_client
 
@@ -49,3 +50,9 @@ async def fetched(link: Any, **options: Any) -> AsyncIterator[tuple[ParamClient,
     async with connected(link, **options) as (client, component):
         await component.fetch_all()
         yield client, component
+
+
+def table_in(path: Path, *key: Any, **which: Any) -> CachedComponent:
+    """A table of a cache that is not open; see `ParamCache.component`."""
+    with ParamCache(path) as cache:
+        return cache.component(*key, **which)

@@ -12,7 +12,7 @@ from typing import Any
 import anyio
 import pytest
 
-from paramclient import Component, ParamCache, ParamClient, Progress
+from paramclient import Component, ParamClient, Progress
 from paramclient.client import client as client_module
 from paramclient.client import link_task
 from paramclient.errors import LinkError
@@ -21,7 +21,7 @@ from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import Air, ArduPilotVehicle, Vehicle
 from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
-from tests.client.conftest import beside
+from tests.client.conftest import beside, table_in
 from tests.shell import Tap, a_client, bits, generic, residue, small_px4
 
 pytestmark = pytest.mark.anyio
@@ -118,8 +118,7 @@ async def test_what_was_learnt_is_written_however_the_client_ends(how: str, tmp_
             scope.cancel()
             await anyio.sleep_forever()
     assert scope.cancelled_caught == (how == "scope")
-    with ParamCache(tmp_path / "cache") as cache:
-        assert bits(cache.component(system=1).params) == bits(vehicle.params)
+    assert bits(table_in(tmp_path / "cache", system=1).params) == bits(vehicle.params)
 
 
 async def test_a_scope_around_a_client_has_the_file_closed_before_it_ends() -> None:

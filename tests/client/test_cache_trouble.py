@@ -22,7 +22,7 @@ from paramclient.client import cache_writer
 from paramclient.provision import apply
 from paramclient.sim import PX4Vehicle
 from tests.caches import PX4, full_disk, rubbish, set_aside, stored, update
-from tests.client.conftest import connected, fetched
+from tests.client.conftest import connected, fetched, table_in
 from tests.shell import Tap, bits, simulated_time_loop, small_px4
 
 NAME = "PARAM_01"
@@ -184,8 +184,7 @@ async def test_a_durable_set_is_on_the_disk_with_its_line_when_it_returns(tmp_pa
             assert (await component.set(NAME, value, durable=True)).status == "accepted"
             with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as other:
                 assert other.execute("SELECT count(*) FROM history").fetchone() == (min(number + 1, 2),)
-            with ParamCache(path) as cache:
-                assert cache.component().params[NAME].value == value
+            assert table_in(path).params[NAME].value == value
 
 
 async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_vehicle_has(tmp_path: Path) -> None:
@@ -289,8 +288,7 @@ async def test_a_clock_that_cannot_be_costs_a_warning_and_nothing_is_lost(
         await anyio.sleep(cache_writer.RETRY_INTERVAL + 1.0)
     [warning] = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
     assert warning.startswith("continuing without the cache: ")
-    with ParamCache(path) as cache:
-        assert bits(cache.component(system=1).params) == bits(vehicle.params)
+    assert bits(table_in(path, system=1).params) == bits(vehicle.params)
 
 
 # The cache's folder
@@ -339,12 +337,10 @@ async def test_a_file_that_goes_is_followed_by_one_that_holds_everything(
         await component.set(NAME, 55)
         await anyio.sleep(seconds_to_the_end)
         if seconds_to_the_end:
-            with ParamCache(path) as cache:
-                assert bits(cache.component(system=1).params) == bits(vehicle.params)
-    with ParamCache(path) as cache:
-        table = cache.component(system=1)
-        assert (table.complete, table.hash) == (True, vehicle.announced_hash())
-        assert bits(table.params) == bits(vehicle.params)
+            assert bits(table_in(path, system=1).params) == bits(vehicle.params)
+    table = table_in(path, system=1)
+    assert (table.complete, table.hash) == (True, vehicle.announced_hash())
+    assert bits(table.params) == bits(vehicle.params)
     async with connected(vehicle, cache=path) as (_, component):
         assert (await component.fetch_all()).source == "cache"
 
@@ -361,5 +357,4 @@ async def test_half_a_table_removes_nothing_from_a_file_that_others_made(path: P
         await component.get("PARAM_03")
         vehicle.set_param("PARAM_03", 5)
         await anyio.sleep(3.0)
-    with ParamCache(path) as cache:
-        assert len(cache.component(system=1).params) == len(vehicle.params)
+    assert len(table_in(path, system=1).params) == len(vehicle.params)

@@ -35,7 +35,7 @@ from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle
 from paramclient.wire import frames, messages
 from tests.caches import changes as history_of
 from tests.caches import read_only
-from tests.client.conftest import connected, fetched
+from tests.client.conftest import connected, fetched, table_in
 from tests.shell import (
     VALUES,
     Radio,
@@ -66,8 +66,7 @@ async def session(
 
 def kept(path: Path, system: int = 1) -> dict[str, int]:
     """The values that the cache holds."""
-    with ParamCache(path) as cache:
-        return bits(cache.component(system=system).params)
+    return bits(table_in(path, system=system).params)
 
 
 def history(path: Path, name: str | None = None) -> list[tuple[str, Any, Any, str]]:
@@ -306,13 +305,11 @@ async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetche
             value = component.params["PARAM_01"].value
             assert value == 1, "another vehicle may have been received before"
             await component.get("PARAM_01")
-    with ParamCache(path) as cache:
-        params = cache.component(component.identity.key).params
+    params = table_in(path, component.identity.key).params
     assert params["PARAM_01"].value == 99
     assert ("PARAM_02" in params) != fetched
     assert (await session(changed, path)).source == ("cache" if fetched else "stream")
-    with ParamCache(path) as cache:
-        assert bits(cache.component(component.identity.key).params) == bits(changed.params)
+    assert bits(table_in(path, component.identity.key).params) == bits(changed.params)
 
 
 # Keeping it right
@@ -404,8 +401,7 @@ async def test_a_change_by_another_station_is_in_the_history_with_its_address(pa
         await component.set("PARAM_02", 22)
         vehicle.set_param("PARAM_04", 44)
         await asyncio.sleep(1.0)
-        with ParamCache(path) as cache:
-            assert cache.component().params["PARAM_04"].value == 44, "while the client is open"
+        assert table_in(path).params["PARAM_04"].value == 44, "while the client is open"
     assert {(name, by) for name, _, _, by in history(path)} == {
         ("PARAM_01", "station 254/190"),
         ("PARAM_02", "us"),

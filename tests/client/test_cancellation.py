@@ -19,11 +19,11 @@ from typing import Any
 import anyio
 import pytest
 
-from paramclient import Component, ParamCache, ParamClient
+from paramclient import Component, ParamClient
 from paramclient.sim import Air, PX4Vehicle
 from paramclient.wire import messages
 from tests.caches import set_aside
-from tests.client.conftest import connected, fetched
+from tests.client.conftest import connected, fetched, table_in
 from tests.shell import (
     VALUES,
     FlakyLink,
@@ -219,8 +219,7 @@ async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path, point: st
         if not is_struck:
             break
     assert 5 < number < POINTS_MAX - 1
-    with ParamCache(path) as cache:
-        cached = cache.component()
-        assert bits(cached.params) == bits(vehicle.params)
-        assert cached.hash == vehicle.announced_hash()
+    cached = table_in(path)
+    assert bits(cached.params) == bits(vehicle.params)
+    assert cached.hash == vehicle.announced_hash()
     assert not set_aside(path)

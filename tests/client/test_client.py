@@ -358,12 +358,10 @@ async def test_a_silent_component_delays_no_other_component(autopilot: int) -> N
     parts = [silent(**at, autopilot=autopilot) for at in ({"component": 100}, {"system": 2})]
     async with a_client(Air([*parts, generic()])) as client:
         component = await client.component(system=1, component=1)
-        began = anyio.current_time()
-        assert (await component.fetch_all()).complete
-        assert anyio.current_time() - began < 0.5
-        began = anyio.current_time()
-        everything = await client.fetch_all(refresh=True)
-        assert anyio.current_time() - began < 3.0
+        with anyio.fail_after(0.5):
+            assert (await component.fetch_all()).complete
+        with anyio.fail_after(3.0):
+            everything = await client.fetch_all(refresh=True)
         assert everything.results.keys() == {(1, 1)}
         assert everything.silent.keys() == {(1, 100), (2, 1)}
         for error in everything.silent.values():
@@ -401,10 +399,8 @@ async def test_a_vehicle_that_answers_nothing_ends_a_fetch_within_7_s() -> None:
     for options in ({}, {"component": 100, "autopilot": messages.MAV_AUTOPILOT_INVALID}):
         async with a_client(silent(**options)) as client:
             await asyncio.sleep(1.5)
-            began = anyio.current_time()
-            with pytest.raises(NoReply, match="answers no request"):
+            with pytest.raises(NoReply, match="answers no request"), anyio.fail_after(7.0):
                 await client.fetch_all()
-            assert anyio.current_time() - began < 7.0
 
 
 async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:

@@ -8,10 +8,10 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import NoReply, ParamCache, ParamClient, SetOutcome, SetStatus, SyncState
+from paramclient import NoReply, ParamClient, SetOutcome, SetStatus, SyncState
 from paramclient.model.values import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
-from tests.client.conftest import connected, fetched
+from tests.client.conftest import connected, fetched, table_in
 from tests.conversations.test_fetch import new_vehicle
 from tests.conversations.virtual import Silence
 
@@ -50,8 +50,7 @@ async def test_a_refresh_of_a_cached_table(kind: str, tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     async with ParamClient(world.endpoint, cache=cache) as client:
         count = (await (await client.component()).fetch_all()).count
-    with ParamCache(cache) as opened:
-        synced_at = opened.component(system=1).synced_at
+    synced_at = table_in(cache, system=1).synced_at
     received = [0]
     assert isinstance(world.vehicle, PX4Vehicle | ArduPilotVehicle)
     world.vehicle.load(world.wanted)
@@ -79,8 +78,7 @@ async def test_a_refresh_of_a_cached_table(kind: str, tmp_path: Path) -> None:
         world.endpoint.at = 1e9
         await anyio.sleep(2.0)
         assert (component.state, component.sync_state) == ("cached", SyncState.UNSYNCED)
-    with ParamCache(cache) as opened:
-        assert opened.component(system=1).synced_at == synced_at
+    assert table_in(cache, system=1).synced_at == synced_at
 
 
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list", "generic"])
@@ -105,8 +103,7 @@ async def test_set_many(kind: str, delay: float, tmp_path: Path) -> None:
 
         await world.until_silent(lambda: world.vehicle.requests["PARAM_SET"] >= 40, call)
     assert len(accepted) >= 10
-    with ParamCache(cache) as opened:
-        params = opened.component(system=1).params
+    params = table_in(cache, system=1).params
     for name in accepted:
         value = world.wanted[name]
         assert value == params[name].value == component.params[name].value == world.vehicle.param(name).value

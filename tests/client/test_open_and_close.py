@@ -15,11 +15,11 @@ import anyio.abc
 import anyio.lowlevel
 import pytest
 
-from paramclient import ClientClosed, ParamCache, ParamClient, UsageError
+from paramclient import ClientClosed, ParamClient, UsageError
 from paramclient.client import core
 from paramclient.links import Peer, SimLink
 from paramclient.sim import Endpoint
-from tests.client.conftest import beside
+from tests.client.conftest import beside, table_in
 from tests.shell import a_client, generic, small_px4
 
 pytestmark = pytest.mark.anyio
@@ -158,8 +158,7 @@ async def test_a_cancelled_aclose_closes_nevertheless(tmp_path: Path) -> None:
             await client.aclose()
         assert scope.cancelled_caught
         assert not core.running
-    with ParamCache(tmp_path / "cache") as cache:
-        assert len(cache.component(system=1).params) == len(vehicle.params)
+    assert len(table_in(tmp_path / "cache", system=1).params) == len(vehicle.params)
 
 
 async def test_an_error_in_a_task_of_the_client_reaches_its_callers(caplog: pytest.LogCaptureFixture) -> None:

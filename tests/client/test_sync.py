@@ -26,7 +26,7 @@ from paramclient import (
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire import frames
 from paramclient.wire.messages import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
-from tests.client.conftest import connected, fetched
+from tests.client.conftest import connected, fetched, table_in
 from tests.shell import (
     VALUES,
     FlakyLink,
@@ -131,8 +131,7 @@ async def test_parameters_that_appear_and_go_do_so_in_the_cache_too(path: Path) 
             assert ("changed", "GRIP_ENABLE") in {(each.kind, each.name) for each in reported}
             kind = "added" if is_enabled else "removed"
             assert {each.name for each in reported if each.kind == kind} == group.keys()
-    with ParamCache(path) as cache:
-        kept = cache.component()
+    kept = table_in(path)
     assert (kept.count, kept.complete) == (len(table), True)
     assert {name: param.index for name, param in kept.params.items()} == {
         name: param.index for name, param in vehicle.params.items()

@@ -179,10 +179,8 @@ async def test_a_component_may_have_both_kinds_or_none() -> None:
         assert (node.plain.table.params["A"].value, node.extended.table.params["A"].value) == (5, "text")
         assert {session.dialect.has_ack for session in node.sessions} == {False, True}
         px4 = await conversation.node(1, 1)
-        began = anyio.current_time()
-        with pytest.raises(errors.NoReply, match="list of 1/1"):
+        with pytest.raises(errors.NoReply, match="list of 1/1"), anyio.fail_after(25.0):
             await fetch_all(px4.extended)
-        assert anyio.current_time() - began < 25.0
         assert not px4.extended.table.params
         assert len(conversation.sent_of(messages.ParamExtRequestList)) < 15
         assert len(conversation.sent_of(messages.ParamRequestList)) == 1

@@ -243,10 +243,8 @@ async def test_calls_go_on_after_the_computer_was_suspended(kind: str, at: float
 async def test_a_component_without_parameters_at_all_is_no_reply_within_seconds() -> None:
     async with talking(Partial(serves=("commands",))) as (_, session):
         for call in (fetch_all(session), read(session, "MODE"), write(session, "MODE", 1)):
-            began = anyio.current_time()
-            with pytest.raises(NoReply):
+            with pytest.raises(NoReply), anyio.fail_after(40.0):
                 await call
-            assert anyio.current_time() - began < 40.0
 
 
 async def test_a_slow_vehicle_is_waited_for() -> None:

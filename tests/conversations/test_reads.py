@@ -54,10 +54,8 @@ async def test_a_vehicle_that_answers_other_reads_has_no_such_parameter(
         vehicle_has_roll = "MC_ROLL_P" in vehicle.params
         if vehicle_has_roll:
             await read(session, "MC_ROLL_P")
-        began = anyio.current_time()
-        with pytest.raises(UnknownParameter) as caught:
+        with pytest.raises(UnknownParameter) as caught, anyio.fail_after(3.0):
             await read(session, which)
-        assert anyio.current_time() - began < 3.0
         assert (caught.value.name if isinstance(which, str) else caught.value.index) == which
         assert ("MC_ROLL_P" in str(caught.value)) is (vehicle_has_roll and which == "MC_ROLLP")
 

@@ -146,11 +146,9 @@ async def test_px4_clamps_a_value_later_which_a_watched_write_reports() -> None:
 async def test_a_read_only_parameter_is_refused_with_its_reason(param_error: bool) -> None:
     vehicle = ArduPilotVehicle(param_error=param_error)
     async with talking(Air.symmetric([vehicle], delay=0.02)) as (conversation, session):
-        began = anyio.current_time()
-        with pytest.raises(errors.Refused, match="read only") as caught:
+        with pytest.raises(errors.Refused, match="read only") as caught, anyio.fail_after(3.0):
             await write(session, "BARO1_GND_PRESS", 5.0)
         assert (caught.value.code, caught.value.name) == (errors.ParamErrorCode.READ_ONLY, "BARO1_GND_PRESS")
-        assert anyio.current_time() - began < 3.0
         assert len(conversation.sent_of(ParamSet)) == 1
 
 
@@ -416,10 +414,8 @@ async def test_no_set_is_sent_to_a_vehicle_that_does_not_say_again_which_one_it_
         endpoint.up = lambda message: not isinstance(message, CommandLong)
         conversation.station.interrupt()
         conversation.station.resume(anyio.current_time())
-        began = anyio.current_time()
-        with pytest.raises(errors.NoReply, match="the identity of 1/1"):
+        with pytest.raises(errors.NoReply, match="the identity of 1/1"), anyio.fail_after(10.0):
             await write(session, "MC_ROLL_P", 3.5)
-        assert anyio.current_time() - began < 10.0
         assert not conversation.sent_of(ParamSet)
         endpoint.up = lambda message: True
         assert (await write(session, "MC_ROLL_P", 3.5)).status == "accepted"
