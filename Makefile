@@ -72,7 +72,7 @@ coverage: $(VENV)/with-test
 	done; test -z "$$failed"
 
 soak: $(VENV)/with-test
-	$(BIN)/python -m tests.soak --sessions $(SESSIONS)
+	SESSIONS=$(SESSIONS) $(BIN)/python -m pytest -m slow --numprocesses auto tests/conversations/test_sessions.py
 
 kills: $(VENV)/with-test
 	$(BIN)/python bench/kills.py --kills $(KILLS)

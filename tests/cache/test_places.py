@@ -39,6 +39,7 @@ def filled(path: Path) -> Path:
 
 
 def test_the_users_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert default_path().is_relative_to(Path.home()), "of a test, which has a home of its own"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert default_path() == tmp_path / "paramclient" / "parameters.sqlite3"
     with ParamCache() as cache:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import Any, TypeAlias
 
 import anyio
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, seed, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 
@@ -68,12 +69,9 @@ Step = Callable[[World], Awaitable[object]]
 class Sessions(RuleBasedStateMachine):
     """Collects the steps of a session, and runs it in virtual time at the end."""
 
-    begun_sessions = 0
-
     @initialize(kind=st.sampled_from(list(MAKERS)), faults=st.sampled_from(FAULTS), seed=st.integers(0, 1000))
     def begin(self, kind: str, faults: Faults, seed: int) -> None:
         """Choose vehicle and link."""
-        Sessions.begun_sessions += 1
         self.kind, self.faults, self.seed = kind, faults, seed
         self.steps: list[Step] = []
 
@@ -183,5 +181,13 @@ def test_sessions_end_with_the_vehicles_table() -> None:
 
 
 @pytest.mark.slow
-def test_many_sessions() -> None:
-    run_state_machine_as_test(Sessions, settings=settings(SETTINGS, max_examples=200, stateful_step_count=25))
+@pytest.mark.parametrize("number", range(int(os.environ.get("SESSIONS", "200")) // 100))
+def test_a_hundred_sessions_of_a_seed(number: int) -> None:
+    """`make soak` runs many of these. A failure is reported with the shortest session that fails."""
+
+    @seed(number)
+    class Seeded(Sessions):
+        pass
+
+    chosen = settings(SETTINGS, max_examples=100, stateful_step_count=30, derandomize=False, database=None)
+    run_state_machine_as_test(Seeded, settings=chosen)
