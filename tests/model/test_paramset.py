@@ -50,14 +50,6 @@ def test_raw_bytes_equal_only_raw_bytes() -> None:
     assert not WrittenParam("P", 1).is_held_by(raw)  # the other four bytes are unknown
 
 
-def test_raw_bytes_of_a_small_type_have_four_bytes() -> None:
-    """ArduPilot can send a float that its own integer type cannot hold."""
-    raw = struct.pack("<f", 1e20)
-    param = Param("P", raw, ParamType.INT8, 0, int.from_bytes(raw, "little"))
-    assert WrittenParam.of(param).is_held_by(param)
-    assert not WrittenParam("P", struct.pack("<f", 2e20)).is_held_by(param)
-
-
 def param(
     name: str,
     value: Value,

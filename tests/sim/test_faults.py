@@ -10,10 +10,9 @@ from typing import Literal
 import pytest
 
 from paramclient.errors import CommandResult
-from paramclient.model.values import Encoding, ParamType
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import frames, messages
-from tests.ground_station import LIST, Station, indices, names, read, write
+from tests.ground_station import LIST, Station, indices, names, read
 
 NO_INDEX = messages.NO_INDEX
 TEN = {f"P{number}": number for number in range(10)}
@@ -46,19 +45,6 @@ class TestDead:
 
 
 class TestWhenListed:
-    @EVERY_KIND
-    def test_a_value_changes_during_a_list(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=TEN, burst=1)
-        vehicle.when_listed(4, lambda: vehicle.set_param("P1", 100))
-        vehicle.when_listed(4, lambda: vehicle.set_param("P8", 800))
-        values = Station(vehicle).ask(LIST, seconds=0.5)
-        first = {value.param_index: value.raw for value in reversed(values)}
-        before, after = vehicle.param("P1"), vehicle.param("P8")
-        assert (before.value, after.value) == (100, 800)
-        encoding = Encoding.C_CAST if kind is ArduPilotVehicle else Encoding.BYTEWISE
-        assert first[1] == write("P1", 1, ParamType.INT32, cast=encoding is Encoding.C_CAST).raw
-        assert first[8] == write("P8", 800, ParamType.INT32, cast=encoding is Encoding.C_CAST).raw
-
     def test_the_count_rises_and_falls(self) -> None:
         vehicle = ArduPilotVehicle(
             table=TEN | {"Q_ENABLE": 0, "R": 5}, groups={"Q_ENABLE": {"Q_A": 1, "Q_B": 2}}, burst=1
@@ -70,19 +56,6 @@ class TestWhenListed:
         stream = [value for value in values if value.param_index != NO_INDEX]
         assert names(stream) == [*TEN, "Q_ENABLE", "Q_A", "R"]
         assert indices(stream) == list(range(13))
-
-
-@EVERY_KIND
-class TestSwitchingOn:
-    def test_the_heartbeat_has_the_boot_state(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=TEN, boot_time=2.5)
-        station = Station(vehicle).wait(4.5)
-        beats = station.receive(messages.Heartbeat)
-        ready = beats[-1].system_status
-        assert ready in (3, 4)
-        assert [beat.system_status for beat in beats] == [1, 1, 1, ready, ready]
-        vehicle.reboot(station.now)
-        assert station.wait(0.5).receive(messages.Heartbeat)[0].system_status == 1
 
 
 class TestClock:

@@ -75,18 +75,6 @@ def refusal(answer: Packet) -> tuple[int, ...]:
     return tuple(answer.data)
 
 
-def test_param_pck_is_read_with_one_size() -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    assert pilot.ask(Opcode.OPEN_FILE_RO, PARAMS).data == (12 * 1382).to_bytes(4, "little")
-    first = pilot.ask(Opcode.READ_FILE, size=100).data
-    assert first == param_pck.encode(packed(pilot.vehicle), read_size=100)[:100]
-    assert refusal(pilot.ask(Opcode.READ_FILE, size=101)) == (FileErrorCode.FAIL_ERRNO, 22)
-    assert pilot.ask(Opcode.READ_FILE, size=100).data == first
-    assert len(pilot.burst(size=100)) == 1 + -(
-        -len(param_pck.encode(packed(pilot.vehicle), read_size=100)) // 100
-    )
-
-
 def packed(vehicle: Vehicle) -> list[PackedParam]:
     return [PackedParam(each.name, ParamType(each.type), each.bits, None) for each in vehicle.params.values()]
 
@@ -167,14 +155,6 @@ class TestPace:
         (answer,) = other.listen(0.1)
         assert refusal(answer) == (FileErrorCode.FAIL,)
 
-    def test_five_requests_wait_and_more_are_dropped(self) -> None:
-        pilot = Pilot(ArduPilotVehicle())
-        pilot.vehicle.files["a"] = bytes(5000)
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
-        for number in range(8):
-            pilot.send(Packet(100 + 2 * number, 3, Opcode.READ_FILE, size=10, offset=10 * number))
-        assert [each.offset for each in pilot.listen(1.0)] == [0, 10, 20, 30, 40]
-
     def test_px4_ends_a_burst_after_168_blocks(self) -> None:
         pilot = Pilot(PX4Vehicle())
         pilot.vehicle.files["a"] = bytes(50_000)
@@ -184,19 +164,6 @@ class TestPace:
         assert {len(each.data) for each in blocks} == {239}
         rest = pilot.burst(session=0, offset=168 * 239)
         assert sum(len(each.data) for each in (*blocks, *rest) if each.opcode == Opcode.ACK) == 50_000
-
-    def test_px4_answers_requests_during_a_burst(self) -> None:
-        pilot = Pilot(PX4Vehicle())
-        pilot.vehicle.files["a"] = bytes(50_000)
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
-        pilot.send(Packet(100, 0, Opcode.BURST_READ_FILE, size=239))
-        assert len(pilot.listen(0.01)) > 20
-        pilot.send(Packet(300, 0, Opcode.READ_FILE, size=5))
-        assert Opcode.READ_FILE in {each.requested for each in pilot.listen(0.001)}
-        pilot.send(Packet(400, 0, Opcode.BURST_READ_FILE, offset=20_000, size=239))
-        blocks = [each for each in pilot.listen(0.1) if each.offset >= 20_000]
-        assert [each.offset for each in blocks] == [20_000 + 239 * at for at in range(126)] + [50_000]
-        assert [each.sequence for each in blocks[:2]] == [401, 402]
 
 
 class TestSwitches:

@@ -13,7 +13,7 @@ from paramclient.model.values import Encoding, Param, ParamType, Value, decode_v
 from paramclient.protocol import param_pck
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam, ardupilot_table, px4_table
-from paramclient.wire import frames, messages
+from paramclient.wire import messages
 from tests.recordings import (
     NAMES,
     Messages,
@@ -22,7 +22,6 @@ from tests.recordings import (
     from_vehicle,
     last_list,
     param_values,
-    read,
     replay,
 )
 
@@ -30,12 +29,6 @@ PX4_HASH = 0xCF579589
 BAROMETER = ("CAL_BARO0_ID", "CAL_BARO0_OFF", "CAL_BARO0_PRIO")
 """Parameters that the recorded PX4 sets during boot, and saves only after the first change by a user."""
 
-UNKNOWN_IDS = {8, 380, 410, 411}
-"""Messages in the logs that pymavlink's dialect does not define."""
-
-
-def message_id(data: bytes) -> int:
-    return int.from_bytes(data[7:10], "little")
 
 
 def params(values: Iterable[messages.ParamValue], encoding: Encoding) -> list[Param]:
@@ -49,47 +42,6 @@ def params(values: Iterable[messages.ParamValue], encoding: Encoding) -> list[Pa
 
 
 class TestDecoding:
-    def test_no_recording_is_missing(self) -> None:
-        assert len(NAMES) == 20
-
-    @pytest.mark.parametrize("name", NAMES)
-    def test_every_frame_of_a_known_message_is_found_and_checked(self, name: str) -> None:
-        records = read(name)
-        assert {message_id(record.data) for record in records if record.frame is None} <= UNKNOWN_IDS
-        for record in records:
-            if record.frame is not None:
-                assert record.frame.message_id == message_id(record.data)
-                assert record.frame.system == record.system
-        assert {record.system for record in records} == {1, 255}
-
-    @pytest.mark.parametrize("name", NAMES)
-    def test_a_session_as_one_stream_has_the_same_frames(self, name: str) -> None:
-        records = [record for record in read(name) if record.frame is not None]
-        framer = frames.Framer()
-        stream = b"".join(record.data for record in records)
-        found = [
-            frame for at in range(0, len(stream), 100) for frame in framer.receive(stream[at : at + 100])
-        ]
-        assert found == [record.frame for record in records]
-        assert framer.skipped == 0
-
-    @pytest.mark.parametrize("name", NAMES)
-    def test_decoded_messages_encode_to_the_same_bytes(self, name: str) -> None:
-        """For the messages of the parameter protocol, which `wire` decodes completely."""
-        values = (
-            messages.ParamValue | messages.ParamSet | messages.ParamRequestRead | messages.ParamRequestList
-        )
-        kinds = values | messages.FileTransfer
-        for record in read(name):
-            message = record.message
-            if isinstance(message, kinds):
-                assert record.frame is not None
-                _, system, component, sequence, _, version = record.frame
-                again = messages.encode(
-                    message, system=system, component=component, sequence=sequence, version=version
-                )
-                assert again == record.data
-
     def test_px4s_table_and_hash(self) -> None:
         values = param_values(from_vehicle("px4_full_download"))
         first = next(at for at, value in enumerate(values) if value.param_id == messages.HASH_CHECK)
@@ -266,28 +218,6 @@ PX4: dict[str, tuple[Callable[[str], PX4Vehicle], float]] = {
     "px4_list_restarted": (px4_of, 0.0124),
     "px4_restart_mid_stream": (px4, 0.7770),
 }
-
-
-def test_the_comparison_detects_changed_messages() -> None:
-    """Its tolerance is 20 ms; the first read was answered 41 ms after its request."""
-    name = "ardupilot_get_set"
-    log = compared(from_vehicle(name))
-    places = [place for place, (_, each) in enumerate(log) if isinstance(each, messages.ParamValue)]
-    time, value = log[places[0]]
-    assert isinstance(value, messages.ParamValue)
-
-    def found(*instead: tuple[float, messages.Message]) -> list[str]:
-        changed = [*log[: places[0]], *instead, *log[places[0] + 1 :]]
-        return differences(name, log, sorted(changed, key=lambda item: item[0]), burst=10)
-
-    for same in (0.0, 0.019, -0.019):
-        assert found((time + same, value)) == []
-    assert found()
-    assert found((time, value), (time + 0.001, value))
-    assert found((time + 0.021, value))
-    assert found((time - 0.021, value))
-    for other in ({"raw": bytes(4)}, {"param_count": 1}, {"param_type": 1}):
-        assert found((time, value._replace(**other)))
 
 
 class TestReplay:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import Any
 
@@ -55,14 +54,6 @@ def test_a_vehicle_acknowledges_switches_off_and_returns(make: Any, delay: float
     started_at = [when for when, frame, _ in station.log if frame.sequence == 0][-1]
     assert started_at == pytest.approx(on_at)
     assert (vehicle.version, vehicle.system) == (version, 1)
-
-
-def test_a_vehicle_may_stay_off() -> None:
-    vehicle = generic(reboot_down=math.inf)
-    station = Station(vehicle)
-    reboot(station)
-    assert not [when for when, _, _ in station.wait(100.0).log if when > 0.3]
-    assert vehicle.next_deadline() is None
 
 
 @pytest.mark.parametrize(

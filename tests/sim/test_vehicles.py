@@ -8,8 +8,6 @@ import struct
 from collections.abc import Callable
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.model.values import TYPES_BY_NAME, Param, ParamType, Value
@@ -59,14 +57,6 @@ EVERY_KIND = [lambda: GenericVehicle(SMALL), PX4Vehicle, ArduPilotVehicle]
 
 @pytest.mark.parametrize("kind", EVERY_KIND)
 class TestEveryVehicle:
-    @pytest.mark.parametrize("start", [0.0, -5.0, 1e6])
-    def test_a_heartbeat_each_second_from_the_first_call_on(
-        self, kind: Callable[[], Vehicle], start: float
-    ) -> None:
-        station = Station(kind(), start=start).wait(3.5)
-        beats = [time - start for time, _, message in station.log if isinstance(message, messages.Heartbeat)]
-        assert beats == pytest.approx([0.0, 1.0, 2.0, 3.0])
-
     def test_messages_for_others_are_ignored(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
         station = Station(vehicle).wait(0.5)
@@ -98,52 +88,12 @@ class TestEveryVehicle:
         assert len(station.ask(LIST, seconds=1.5)) >= len(vehicle.params)
 
 
-_text = st.sampled_from(["", "A_FLOAT", "b_int", "_HASH_CHECK", "A" * 16, "\xff\x01"])
-_target = st.sampled_from([0, 1, 2])
-_kind = st.integers(0, 255)
-_requests = st.one_of(
-    st.builds(messages.ParamRequestList, _target, _target),
-    st.builds(messages.ParamRequestRead, _target, _target, _text, st.integers(-32768, 32767)),
-    st.builds(messages.ParamSet, _target, _target, _text, st.binary(min_size=4, max_size=4), _kind),
-    st.builds(messages.CommandLong, _target, _target, st.sampled_from([512, 520, 1])),
-    st.builds(messages.Heartbeat, _kind, _kind),
-)
-
-
-@pytest.mark.parametrize("error", [False, True])
-@pytest.mark.parametrize("kind", [GenericVehicle, PX4Vehicle, ArduPilotVehicle])
-@given(script=st.lists(st.tuples(st.floats(0, 1e4), _requests), max_size=40))
-@settings(max_examples=30, deadline=None)
-def test_random_requests_are_harmless(
-    kind: Callable[..., Vehicle], error: bool, script: list[tuple[float, messages.Message]]
-) -> None:
-    """For all requests and clock jumps: no exception, and all pending work ends."""
-    vehicle = kind(table=SMALL, param_error=error, telemetry=7.0, stream=True)
-    now = 0.0
-    for pause, message in script:
-        now += pause
-        vehicle.receive(messages.encode(message, system=255, component=190, sequence=0), now)
-        deadline = vehicle.next_deadline()
-        assert deadline is not None
-        assert deadline > now
-    assert len(vehicle.data_to_send()) <= 40 * (8 + 4 * len(SMALL)) + 4
-    Station(vehicle, start=now + 10).wait(10)
-
-
 class TestOptions:
     def test_mavlink_1(self) -> None:
         vehicle = ArduPilotVehicle(mavlink_version=1, telemetry=10.0)
         station = Station(vehicle).send(LIST, messages.CommandLong(1, 1, 520)).wait(1.2)
         assert {frame.version for _, frame, _ in station.log} == {1}
         assert len(station.values()) == 1382
-
-    def test_every_system_has_its_own_hardware_id(self) -> None:
-        seen = set()
-        for vehicle in [kind(system=n) for n in (1, 2, 255) for kind in (PX4Vehicle, ArduPilotVehicle)]:
-            station = Station(vehicle).send(messages.CommandLong(vehicle.system, 1, 520))
-            (version,) = station.receive(messages.AutopilotVersion)
-            seen.add((version.uid, version.uid2))
-        assert len(seen) == 6
 
 
 class TestGeneric:
