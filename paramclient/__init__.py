@@ -16,9 +16,8 @@ To find the module of a rule, see "Find the code" in `docs/internals.md`.
 from __future__ import annotations
 
 from paramclient.cache import CachedComponent, ParamCache
-from paramclient.client.client import Event, Events, ParamClient
+from paramclient.client.client import Event, Events, FetchedAll, ParamClient
 from paramclient.client.component import Component, ComponentState
-from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.signing import Signing, read_key
 from paramclient.client.streams import Changes
 from paramclient.errors import (

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Literal, Self, TypeAlias, Unpack
 
 from paramclient.cache import ParamCache
-from paramclient.client.client import COMPONENT_TIMEOUT
+from paramclient.client.client import COMPONENT_TIMEOUT, FetchedAll
 from paramclient.client.component import REBOOT_TIMEOUT, ComponentState
-from paramclient.client.fleet_fetch import FetchedAll
 from paramclient.client.signing import Signing
 from paramclient.client.taps import TrafficReport
 from paramclient.links import Link

@@ -6,7 +6,6 @@
 - `cache_writer`: loads cached tables, writes new values in batches, and waits for the disk
   if a write is durable.
 - `streams`: streams of items and of parameter changes.
-- `fleet_fetch`: fetches of several components.
 - `signing`: keys, options, persistent timestamps.
 - `taps`: the receivers of all frames of a link: the telemetry log, traffic.
 - `blocking`: the client without `await`.

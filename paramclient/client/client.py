@@ -16,17 +16,16 @@ from paramclient.cache import ParamCache
 from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.core import ClientCore
-from paramclient.client.fleet_fetch import FetchedAll, fetch_components
 from paramclient.client.signing import Signing, refused_in_words
 from paramclient.client.streams import Stream, Subscribers
 from paramclient.client.taps import Capture, Traffic, TrafficReport
-from paramclient.errors import AnotherVehicle, ClientClosed, NoReply, ParamClientError, UsageError
+from paramclient.errors import AnotherVehicle, CacheError, ClientClosed, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.model.names import counted
 from paramclient.model.values import Encoding
 from paramclient.protocol import selection
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.fetch import Policy
+from paramclient.protocol.fetch import FetchResult, Policy
 from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.node import Node
 from paramclient.protocol.station import Station
@@ -46,6 +45,9 @@ PROBE_INTERVAL: Final = 0.5
 `HEARTBEAT_WAIT`, in which a component with heartbeats is heard."""
 LISTENING_TIME: Final = HEARTBEAT_WAIT
 """Seconds after the client was opened in which components are waited for, by a fetch of all."""
+SILENT_TIME: Final = 2.95
+"""Seconds from the begin for a component that has never answered a request, where another one on the link
+answers: it costs no more than 3 s."""
 EVENTS_MAX: Final = 1_000
 """Queued events for a consumer, at most."""
 
@@ -444,7 +446,7 @@ class ParamClient:
             if system in (None, each.system) and each.node.identification.has_parameters
         }
         left = None if timeout is None else deadline - anyio.current_time()
-        return await fetch_components(chosen, began, refresh=refresh, timeout=left)
+        return await _fetch_components(chosen, began, refresh=refresh, timeout=left)
 
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss.
@@ -544,3 +546,68 @@ class ParamClient:
         if found is not None:
             hint, awaited = "", f"{awaited}, then {HEARTBEAT_WAIT} s without another vehicle"
         raise NoReply(f"{awaited}{refused}", attempts=0, waited=anyio.current_time() - began, hint=hint)
+
+
+@dataclass(frozen=True, slots=True)
+class FetchedAll:
+    """Result of a fetch of several components.
+
+    Attributes:
+        results: results of the components that responded, by (system, component).
+        silent: errors of the other components, by (system, component). NoReply if the component did not
+            respond or is lost, CacheError if the policy allows no download and nothing is cached.
+    """
+
+    results: Mapping[Address, FetchResult]
+    silent: Mapping[Address, NoReply | CacheError]
+
+    @property
+    def complete(self) -> bool:
+        """Whether `results` has every parameter of every component that responded."""
+        return all(result.complete for result in self.results.values())
+
+
+async def _fetch_components(
+    components: Mapping[Address, Component], began: float, *, refresh: bool, timeout: float | None
+) -> FetchedAll:
+    """Fetch the tables of components in parallel; see `ParamClient.fetch_all`, which began at `began`.
+
+    Raises:
+        NoReply: none responded.
+        UsageError: `refresh` is given, and the client may not download.
+        LinkError: the link failed, or the client was closed.
+    """
+    results: dict[Address, FetchResult] = {}
+    silent: dict[Address, NoReply | CacheError] = {}
+    failures: list[ParamClientError] = []
+    scopes: dict[Address, anyio.CancelScope] = {}
+
+    async def fetch(address: Address, component: Component) -> None:
+        try:
+            with component.limited(None, f"the parameters of {component.node.channel}") as scopes[address]:
+                results[address] = await component.fetch_all(refresh=refresh, timeout=timeout)
+        except (NoReply, CacheError) as error:
+            silent[address] = error
+        except ParamClientError as error:
+            failures.append(error)
+            fetches.cancel_scope.cancel()
+
+    async def give_up_silent() -> None:
+        await anyio.sleep_until(began + SILENT_TIME)
+        has_answered = {at: each.node.channel.answered.is_set() for at, each in components.items()}
+        if any(has_answered.values()):
+            for address, each in components.items():
+                if not has_answered[address] and each.count is None:
+                    scopes[address].cancel()
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(give_up_silent)
+        async with anyio.create_task_group() as fetches:
+            for address, component in components.items():
+                fetches.start_soon(fetch, address, component)
+        tasks.cancel_scope.cancel()
+    if failures:
+        raise failures[0]
+    if silent and not results:
+        raise next(iter(silent.values()))
+    return FetchedAll(results, silent)

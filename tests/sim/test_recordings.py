@@ -30,7 +30,6 @@ BAROMETER = ("CAL_BARO0_ID", "CAL_BARO0_OFF", "CAL_BARO0_PRIO")
 """Parameters that the recorded PX4 sets during boot, and saves only after the first change by a user."""
 
 
-
 def params(values: Iterable[messages.ParamValue], encoding: Encoding) -> list[Param]:
     """Return the values of a full download, without the hash."""
     found = []
