@@ -602,13 +602,3 @@ def test_an_invalid_field_is_rejected(fields: str, problem: str) -> None:
 )
 def test_an_invalid_document_is_rejected(text: str, problem: str) -> None:
     assert problem in str(failed(text))
-
-
-def test_document_errors_have_the_parameters_line() -> None:
-    bad = "".join(f',\n"B{at}": {{"value": 1, "type": "?"}}' for at in range(30))
-    error = failed(f'{{"paramclient": 1, "sets": [{{"params": {{\n"A": {{"value": 1}}{bad}}}}}]}}')
-    lines = str(error).splitlines()
-    assert lines[0].startswith("quad.x:3: sets.0.params.B0.type: unknown type '?'")
-    assert lines[1].startswith("quad.x:4: sets.0.params.B1.type: ")
-    assert lines[20:] == ["and 10 more"]
-    assert error.line == 3

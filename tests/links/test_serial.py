@@ -20,7 +20,6 @@ import anyio.lowlevel
 import pytest
 import serialx
 
-from paramclient.client import link_task
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, link, serial
 from paramclient.links.serial import open_asyncio
@@ -117,30 +116,6 @@ async def test_unplugged_in_the_middle_of_a_download(
         record.getMessage() for record in caplog.records if record.name == "paramclient.client.link_task"
     ]
     assert warning.startswith(f"{cable.link}: lost {cable.device}: unplugged, or ")
-
-
-@pytest.mark.asyncio
-async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_task, "LINK_TIMEOUT", 0.2)
-    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MIN", 0.05)
-    monkeypatch.setattr(link_task, "RECONNECT_BACKOFF_MAX", 0.1)
-    vehicle = generic(stream=True)
-    async with (
-        asyncio.timeout(TIMEOUT),
-        a_client(cable.link) as client,
-        anyio.create_task_group() as tasks,
-    ):
-        tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
-        component = await client.component()
-        cable.pull_out()
-        with pytest.raises(LinkError, match=f"{cable.device} does not exist") as caught:
-            await component.get("PARAM_01")
-        assert isinstance(caught.value.__cause__, FileNotFoundError)
-        cable.plug_in()
-        tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
-        await until(lambda: " open, " in repr(client))
-        assert (await component.get("PARAM_01")).value == 1
-        tasks.cancel_scope.cancel()
 
 
 # The link

@@ -51,22 +51,6 @@ def test_values_and_changes_have_the_times_of_the_log(cache: ParamCache, tmp_pat
     assert line.at == pytest.approx(BOOT + 60, abs=0.01)
 
 
-def test_later_values_in_the_cache_are_kept_and_repetition_changes_nothing(
-    cache: ParamCache, tmp_path: Path
-) -> None:
-    hold(cache, Param("ATC_RAT_RLL_P", 0.3, ParamType.REAL32, 5, 0x3E99999A), BOOT + 1000)
-    path = written(tmp_path, dataflash([*COMMON, FIX, *LATER]))
-    states = []
-    for _ in range(2):
-        anyio.run(import_onboard_log, path, cache)
-        table = cache.load(KEY, 1)
-        assert table is not None
-        assert table.params["ATC_RAT_RLL_P"].value == pytest.approx(0.3)
-        assert table.params["ARMING_CHECK"].value == 1
-        states.append((dict(table.params), cache.history(KEY)))
-    assert states[0] == states[1]
-
-
 def test_types_are_from_the_cached_table_then_from_other_vehicles(cache: ParamCache, tmp_path: Path) -> None:
     hold(cache, Param("ARMING_CHECK", 1, ParamType.INT32, 2, 1), BOOT - 1000)
     hold(cache, Param("SYSID_THISMAV", 3, ParamType.INT16, 1, 3), BOOT - 1000, "uid:aabbccddeeff")

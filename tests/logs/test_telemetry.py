@@ -214,19 +214,6 @@ def save(cache: Path, at: float, **values: int) -> None:
         kept.save(TableUpdate(identity=identity, component=1, autopilot=12, at=at, params=stored))
 
 
-def test_later_observations_in_the_cache_stay(tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    save(cache, NOW + 5000.0, A=77)
-    imported(whole(A=1, B=2).write(tmp_path / "flight.tlog"), cache=cache)
-    assert kept_values(cache) == {"A": 77, "B": 2}
-    assert lines(cache) == [("A", 1, 77, "vehicle", 5000.0)]
-    with ParamCache(cache) as kept:
-        found = kept.component(KEY)
-        assert (found.identity.firmware, found.autopilot, found.complete) == (8, 12, False)
-        assert found.updated_at == NOW + 5000.0
-        assert kept.vehicles()[0].last_seen == NOW + 5000.0
-
-
 def test_a_change_that_was_also_received_live_has_one_line(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     save(cache, NOW + 0.2, A=1)
@@ -235,25 +222,6 @@ def test_a_change_that_was_also_received_live_has_one_line(tmp_path: Path) -> No
     log = whole(A=1).wait(9.0).change("A", 3).wait(1.0).beat()
     imported(log.write(tmp_path / "flight.tlog"), cache=cache)
     assert lines(cache) == [("A", 1, 3, BY_US, pytest.approx(10.25))]
-
-
-def test_a_name_removed_later_is_not_restored(tmp_path: Path) -> None:
-    """Also from an incomplete table: the removal is the later observation."""
-    cache = tmp_path / "cache"
-    log = whole(A=1, OLD=2).write(tmp_path / "flight.tlog")
-    save(cache, NOW + 100.0, A=1, OLD=2)
-    who = Identity(1, "udp", UID)
-    at = NOW + 200.0
-    gone = TableUpdate(identity=who, component=1, autopilot=12, at=at, params=[StoredParam.gone("OLD", at)])
-    with ParamCache(cache) as kept:
-        kept.save(gone)
-    before = lines(cache)
-    assert before == [("OLD", 2, None, "vehicle", 200.0)]
-    imported(log, log, cache=cache)
-    assert kept_values(cache) == {"A": 1}
-    assert lines(cache) == before
-    imported(Log(NOW + 300.0).beat().identify().report("OLD", OLD=5).write(tmp_path / "l.tlog"), cache=cache)
-    assert kept_values(cache) == {"A": 1, "OLD": 5}
 
 
 # The command line

@@ -18,7 +18,6 @@ from paramclient.metadata import Metadata, ParamInfo, read_content, read_metadat
 from paramclient.model.values import ParamType
 
 DATA = Path(__file__).parents[1] / "data"
-EXAMPLES = Path(__file__).parents[2] / "examples"
 PX4, XML, JSON = DATA / "parameters.json", DATA / "apm.pdef.xml", DATA / "apm.pdef.json"
 
 MODE = ParamInfo("MODE", values={0: "Stabilize", 5: "Loiter", 6: "RTL", 9: "Land  now", 0.5: "Half"})

@@ -38,9 +38,7 @@ from paramclient.model.values import (
 from paramclient.protocol.dialect import PLAIN
 
 BYTEWISE, C_CAST = Encoding.BYTEWISE, Encoding.C_CAST
-KNOWN = list(ParamType)
 INTEGERS = [kind for kind in ParamType if kind.is_integer]
-SMALL = [kind for kind in INTEGERS if kind.size <= 4]
 UNDEFINED = [0, 77, 255]
 
 SIGNALLING = [(0xFF800001, 0xFFBFFFFF), (0x7F800001, 0x7FBFFFFF)]
@@ -339,7 +337,6 @@ def test_format_value(value: Value, kind: ParamType, text: str) -> None:
 
 
 KINDS = ParamType
-NAN = struct.pack("<f", math.nan)
 
 
 @pytest.mark.parametrize(

@@ -114,19 +114,3 @@ def test_first_start_only_parameters_are_unused_from_the_second_start_on() -> No
         states.append((len(px4.params), px4.announced_hash()))
     assert states[1] == states[2] != states[0]
     assert states[1][0] == states[0][0] - 3
-
-
-def test_a_reboot_group_appears_after_a_reboot() -> None:
-    vehicle = ArduPilotVehicle(
-        table={"A_ENABLE": 0, "B_ENABLE": 1, "C_ENABLE": 0},
-        groups={"A_ENABLE": {"A_X": 1}, "B_ENABLE": {"B_X": 1}, "C_ENABLE": {"C_X": 1}},
-        reboot_groups=["A_ENABLE", "B_ENABLE"],
-    )
-    station = Station(vehicle)
-    assert list(vehicle.params) == ["A_ENABLE", "B_ENABLE", "B_X", "C_ENABLE"]
-    for name, value in {"A_ENABLE": 1, "B_ENABLE": 0, "C_ENABLE": 1}.items():
-        vehicle.set_param(name, value)
-    assert list(vehicle.params) == ["A_ENABLE", "B_ENABLE", "B_X", "C_ENABLE", "C_X"]
-    reboot(station)
-    station.wait(5.0)
-    assert list(vehicle.params) == ["A_ENABLE", "A_X", "B_ENABLE", "C_ENABLE", "C_X"]

@@ -9,8 +9,8 @@ from collections.abc import Callable
 
 import pytest
 
-from paramclient.errors import ParamErrorCode, UsageError
-from paramclient.model.values import TYPES_BY_NAME, Param, ParamType, Value
+from paramclient.errors import UsageError
+from paramclient.model.values import Param, ParamType
 from paramclient.sim import (
     ArduPilotVehicle,
     FaultyLink,
@@ -88,49 +88,7 @@ class TestEveryVehicle:
         assert len(station.ask(LIST, seconds=1.5)) >= len(vehicle.params)
 
 
-class TestOptions:
-    def test_mavlink_1(self) -> None:
-        vehicle = ArduPilotVehicle(mavlink_version=1, telemetry=10.0)
-        station = Station(vehicle).send(LIST, messages.CommandLong(1, 1, 520)).wait(1.2)
-        assert {frame.version for _, frame, _ in station.log} == {1}
-        assert len(station.values()) == 1382
-
-
-class TestGeneric:
-    def test_every_type_byte_wise(self) -> None:
-        kinds: dict[str, tuple[int, Value]] = {f"T{int(kind)}": (kind, 1) for kind in TYPES_BY_NAME.values()}
-        vehicle = GenericVehicle(kinds | {"T77": (77, b"abcd")})
-        station = Station(vehicle)
-        by_name = {value.param_id: value for value in station.ask(LIST)}
-        assert by_name["T2"].raw == b"\x01\0\0\0"
-        assert by_name["T9"].raw == struct.pack("<f", 1.0)
-        assert by_name["T8"].raw == b"\x01\0\0\0"
-        assert (by_name["T77"].raw, by_name["T77"].param_type) == (b"abcd", 77)
-        (value,) = station.ask(messages.ParamSet(1, 1, "T2", b"\xff\x01\x02\x03", 2))
-        assert value.raw == b"\xff\0\0\0"
-        assert vehicle.values["T2"] == -1
-        (value,) = station.ask(messages.ParamSet(1, 1, "T77", b"wxyz", 77))
-        assert vehicle.values["T77"] == value.raw == b"wxyz"
-
-
-HASH = read("_HASH_CHECK")
-
-
-def hash_set(value: int = 0) -> messages.ParamSet:
-    return messages.ParamSet(1, 1, "_HASH_CHECK", value.to_bytes(4, "little"), ParamType.UINT32)
-
-
 class TestPX4:
-    @pytest.mark.parametrize("by_parameter", [False, True])
-    def test_without_the_hash(self, by_parameter: bool) -> None:
-        vehicle = PX4Vehicle(hash_check=by_parameter)
-        if by_parameter:
-            vehicle.set_param("MAV_HASH_CHK_EN", 0)
-        assert vehicle.announced_hash() is None
-        station = Station(vehicle)
-        assert not station.ask(HASH, hash_set())
-        assert indices(station.ask(LIST, hash_set(), seconds=2.0)) == list(range(903))
-
     def test_invalid_requests_are_not_answered(self) -> None:
         vehicle = PX4Vehicle()
         before = vehicle.values
@@ -147,23 +105,6 @@ class TestPX4:
         )
         assert vehicle.values == before
         assert not station.receive(messages.ParamError)
-
-    def test_errors_of_newer_firmware(self) -> None:
-        station = Station(PX4Vehicle(param_error=True))
-        station.send(
-            read("NO_SUCH"),
-            read(index=5000),
-            write("NO_SUCH", 1, ParamType.INT32),
-            write("SYS_AUTOSTART", 1.0, ParamType.REAL32),
-        )
-        assert [
-            (error.param_id, error.param_index, error.error) for error in station.receive(messages.ParamError)
-        ] == [
-            ("NO_SUCH", -1, 1),
-            ("", 5000, 1),
-            ("NO_SUCH", -1, 1),
-            ("SYS_AUTOSTART", -1, 7),
-        ]
 
     @pytest.mark.parametrize(
         ("name", "value", "changed"),
@@ -258,21 +199,6 @@ class TestArduPilot:
         assert answer.param_type == vehicle.param(name).type
         assert vehicle.param(name).value == stored
         assert answer.raw == struct.pack("<f", stored)
-
-    @pytest.mark.parametrize("error", [False, True])
-    def test_read_only(self, error: bool) -> None:
-        vehicle = ArduPilotVehicle(read_only=["RTL_ALT"], param_error=error)
-        station = Station(vehicle)
-        station.log.clear()
-        station.send(cast("RTL_ALT", 7)).wait(0.5)
-        assert [message for _, _, message in station.log] == [
-            messages.ParamValue("RTL_ALT", struct.pack("<f", 1500), ParamType.INT32, 1382, NO_INDEX),
-            messages.StatusText(4, "Param write denied (RTL_ALT)"),
-            messages.ParamError(255, 190, "RTL_ALT", -1, ParamErrorCode.READ_ONLY),
-        ][: 3 if error else 2]
-        assert vehicle.values["RTL_ALT"] == 1500
-        vehicle.set_param("RTL_ALT", 8)
-        assert vehicle.values["RTL_ALT"] == 8
 
     def test_live_values_are_sent_unsolicited(self) -> None:
         vehicle = ArduPilotVehicle(live_period=10.0)
