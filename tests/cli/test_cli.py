@@ -17,14 +17,14 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import paramclient
-from paramclient import LinkError, ParamCache, ParamType
+from paramclient import LinkError, ParamType
 from paramclient.cli import run
 from paramclient.cli.output import ExitCode, code_of
 from paramclient.errors import ClientClosed, ParamClientError
@@ -38,12 +38,6 @@ URL = "sim:custom"
 TIMEOUT = 60.0  # seconds after which a test fails; a passing test never waits that long
 ESCAPE = "\x1b"
 
-FETCH_KEYS = [
-    *("system", "component", "autopilot", "uid", "count", "received", "source", "hash", "missing"),
-    *("cached", "changed", "lost", "repeated", "round_trip_s"),
-    *("elapsed_s", "bytes_received", "bytes_sent", "params"),
-]
-PARAM_KEYS = ["value", "type", "index", "bits"]
 HASH = "cf579589"
 """Of the simulated PX4 vehicle's table, as the recordings of the real one have it."""
 
@@ -76,11 +70,6 @@ def warm(warm_cache: bytes, tmp_path: Path) -> Path:
     path.touch(mode=0o600)
     path.write_bytes(warm_cache)
     return path
-
-
-def key_of(cache: Path) -> str:
-    """Return the key of the vehicle that was heard last."""
-    return ParamCache(cache).vehicles()[0].key
 
 
 # processes
@@ -179,14 +168,6 @@ def test_missing_parameters_are_named(command: Command, put: Put) -> None:
     assert "paramclient: incomplete: 1/1 generic did not send 1 parameter, index 1; " in fetched.err
 
 
-def test_the_system_and_the_component_can_be_chosen(command: Command) -> None:
-    assert command("fetch", "sim:px4?system=7", "--vehicle", 7, "--json", "--no-cache").json["system"] == 7
-    absent = command("get", "sim:px4?system=7", "MC_ROLL_P", "--vehicle", 6, "--timeout", 0.2, "--no-cache")
-    assert absent.code == 3
-    absent = command("get", "sim:px4", "MC_ROLL_P", "--vehicle", "1/6", "--timeout", 0.2, "--no-cache")
-    assert absent.code == 3
-
-
 # get
 
 
@@ -258,9 +239,6 @@ def test_fetch_names_what_has_changed_since_an_ardupilot_was_cached(
     assert found["params"]["RTL_ALT"]["value"] == 2500
 
 
-# Differences from the defaults
-
-
 # watch
 
 
@@ -270,14 +248,10 @@ def test_watch_prints_lines_of_json_as_values_change(live_command: Command, tmp_
         process("watch", url, "MC_ROLL_P", "--json", "--no-cache") as watching,
     ):
         assert line_of(watching.stderr) == "watching MC_ROLL_P of 1/1 px4\n"
-        before = datetime.now(UTC)
         done = live_command("set", url, "MC_PITCH_P", 7, "MC_ROLL_P", "nan", "--force", "--no-cache")
         assert done.code == 0
         change = strict(line_of(watching.stdout))
-        assert list(change) == ["time", "name", "old", "new", "by", "kind"]
-        at = datetime.fromisoformat(change.pop("time"))
-        assert before.timestamp() - 0.001 <= at.timestamp() <= time.time()
-        assert at.utcoffset() is not None
+        assert abs(datetime.fromisoformat(change.pop("time")).timestamp() - time.time()) < TIMEOUT
         assert change == {
             "name": "MC_ROLL_P",
             "old": 4.0,
@@ -288,22 +262,6 @@ def test_watch_prints_lines_of_json_as_values_change(live_command: Command, tmp_
         watching.send_signal(signal.SIGINT)
         outcome = ended(watching)
     assert (outcome.code, outcome.out, outcome.err) == (130, "", "")
-
-
-def test_watch_prints_added_and_removed_parameters(live_command: Command) -> None:
-    def line_about(name: str) -> str:
-        while (line := line_of(watching.stdout).partition("  ")[2]).split()[0] != name:
-            pass
-        return line
-
-    with simulated("ardupilot") as url, process("watch", url, "--no-cache") as watching:
-        assert line_of(watching.stderr) == "watching 1382 parameters of 1/1 ardupilot\n"
-        assert live_command("set", url, "EK2_ENABLE", 1, "--no-cache").code == 0
-        assert line_about("EK2_GPS_TYPE") == "EK2_GPS_TYPE  added: 0  (vehicle)\n"
-        assert live_command("set", url, "EK2_ENABLE", 0, "--no-cache").code == 0
-        assert line_about("EK2_GPS_TYPE") == "EK2_GPS_TYPE  removed, was 0  (vehicle)\n"
-        watching.send_signal(signal.SIGTERM)
-        ended(watching)
 
 
 def vehicle_lost_and_found() -> PX4Vehicle:
@@ -347,8 +305,7 @@ def test_watch_prints_events_of_the_vehicle(command: Command, put: Put) -> None:
     assert re.fullmatch("[0-9a-f]{8}", resynced["hash"])
 
 
-@pytest.mark.parametrize("is_json", [True, False])
-def test_a_link_that_fails_during_watch_is_reported_once(command: Command, put: Put, is_json: bool) -> None:
+def test_a_link_that_fails_during_watch_is_reported_once(command: Command, put: Put) -> None:
     class Failing(SimLink):
         received = 0
 
@@ -359,7 +316,7 @@ def test_a_link_that_fails_during_watch_is_reported_once(command: Command, put: 
             return await super().receive()
 
     url = put(Failing(PX4Vehicle(table={"A": 1}), "sim:custom"))
-    watched = command("watch", url, "A", "--no-cache", *(["--json"] if is_json else []))
+    watched = command("watch", url, "A", "--no-cache")
     assert (watched.code, watched.out) == (4, "")
     assert watched.err == "watching A of 1/1 px4\nparamclient: it is gone\n"
 
@@ -393,25 +350,13 @@ def test_link_prints_a_table_of_components(command: Command, put: Put) -> None:
     )
 
 
-def test_a_silent_link_is_exit_code_3(live_command: Command, put: Put) -> None:
+def test_a_silent_link_is_exit_code_3(live_command: Command) -> None:
     silent = live_command("link", "udpin:127.0.0.1:0", "--seconds", 0.3, "--json")
     assert (silent.code, silent.out) == (3, "")
     assert re.fullmatch(
         r"paramclient: no reply: a MAVLink frame on udpin:127\.0\.0\.1:0 in [0-9.]+ s\. Nothing was received "
         r"on udpin:127\.0\.0\.1:0\. Is the vehicle sending to this port\?\n",
         silent.err,
-    )
-
-    class Noise(SimLink):
-        async def receive(self) -> list[tuple[Peer, bytes]]:
-            return [(peer, b"x" * len(data)) for peer, data in await super().receive()]
-
-    noisy = live_command("link", put(Noise(PX4Vehicle())), "--seconds", 0.3)
-    assert (noisy.code, noisy.out) == (3, "")
-    assert re.search(
-        r"a MAVLink frame on sim:custom in [0-9.]+ s\. [1-9][0-9,]* bytes arrived on sim:custom, but "
-        r"no valid MAVLink frame\.$",
-        noisy.err,
     )
 
 
@@ -422,31 +367,6 @@ def test_link_is_live_on_a_terminal() -> None:
     *_, last = shown.out.split("heartbeat")
     assert "px4 quadrotor" in last  # the last table stays
     assert "1/1 standby: " in last
-    waiting = on_terminal("link", "udpin:127.0.0.1:0", "--seconds", 0.5)
-    assert waiting.code == 3
-    assert "0 frames, 0 lost" in waiting.out
-    one = on_terminal("link", "sim:px4", "--seconds", 1, "--json")
-    assert strict(one.out)["components"][0]["system"] == 1
-
-
-# Without a link
-
-
-def test_show_lists_several_vehicles_and_prints_one(command: Command, warm: Path) -> None:
-    assert command("get", "sim:ardupilot?system=2", "RTL_ALT", "--cache", warm).code == 0
-    listed = command("show", "--cache", warm)
-    assert [row[:2] for row in listed.words] == [
-        ["component", "autopilot"],
-        ["2/1", "ardupilot"],
-        ["1/1", "px4"],
-    ]
-    assert len(command("show", "--json", "--cache", warm).json["components"]) == 2
-    key = key_of(warm)
-    for name in ("2", key, key[: len("uid:") + 6], key.removeprefix("uid:").upper()):
-        [component] = command("show", name, "--json", "--cache", warm).json["components"]
-        assert component["system"] == 2
-        assert list(component["params"]) == ["RTL_ALT"]
-    assert [row[0] for row in command("show", "2", "--cache", warm).words] == ["name", "RTL_ALT"]
 
 
 # Exit codes and signals
@@ -604,7 +524,7 @@ def test_sim_ends_cleanly() -> None:
 
 
 def test_a_closed_pipe_ends_the_command_silently(warm: Path) -> None:
-    for arguments in (["fetch", "sim:px4"], ["fetch", "sim:px4", "--json"], ["show"], ["cache", "list"]):
+    for arguments in (["fetch", "sim:px4"], ["show", "--json"]):
         reading, writing = os.pipe()
         os.close(reading)
         try:
@@ -676,7 +596,7 @@ def test_the_module_runs_the_command_line() -> None:
     "arguments",
     [
         [],
-        *([name] for name in ("fetch", "get", "set", "watch", "link", "show", "sim")),
+        ["fetch"],
         ["cache", "remove"],
     ],
     ids=" ".join,

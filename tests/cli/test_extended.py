@@ -78,36 +78,8 @@ def test_files_and_comparisons(command: Command, put: Put, tmp_path: Path) -> No
     other = command("diff", file, url, *CAMERA)
     assert other.code == 1
     assert other.rows[1:] == [["CAM_EV", "0.5", "only left"], ["CAM_NAME", "Front", "Rear", "different"]]
-    document = command("diff", file, url, *CAMERA, "--json").json
-    assert {name: each["is"] for name, each in document["params"].items()} == {
-        "CAM_EV": "only left",
-        "CAM_NAME": "different",
-    }
     refused = command("save", url, tmp_path / "camera.param", *CAMERA)
     assert (refused.code, "cannot hold extended parameters" in refused.err) == (2, True)
-    assert command("diff", file, url, *CAMERA, "--only", "CAM_M*").code == 0
-
-
-def test_apply_writes_what_differs_and_reads_it_back(command: Command, put: Put, tmp_path: Path) -> None:
-    camera = small()
-    url = put(camera)
-    file = tmp_path / "camera.json"
-    assert command("save", url, file, *CAMERA).code == 0
-    camera.set_ext_param("CAM_NAME", "Rear")
-    camera.set_ext_param("CAM_MODE", 9)
-    camera.set_ext_param("CAM_KEY", b"\1")
-    dry = command("apply", url, file, *CAMERA, "--dry-run")
-    assert (dry.code, [row[:3] for row in dry.rows[1:]]) == (
-        0,
-        [["CAM_MODE", "9", "1"], ["CAM_NAME", "Rear", "Front"], ["CAM_KEY", "hex:01", "hex:ff00fe"]],
-    )
-    assert camera.ext_values["CAM_MODE"] == 9
-    done = command("apply", url, file, *CAMERA)
-    assert (done.code, [row[-1] for row in done.rows[1:]]) == (0, ["accepted"] * 3), done.err
-    assert camera.ext_values == {"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe", "CAM_EV": 0.5}
-    again = command("apply", url, file, *CAMERA)
-    assert (again.code, again.out) == (0, "")
-    assert "4 unchanged" in again.err
 
 
 def test_apply_reports_what_it_cannot_do(command: Command, put: Put, tmp_path: Path) -> None:
@@ -128,58 +100,24 @@ def test_apply_reports_what_it_cannot_do(command: Command, put: Put, tmp_path: P
     assert (kinds.code, "are plain ones, and extended ones are needed" in kinds.err) == (2, True)
 
 
-def test_restore_undoes_the_last_apply(command: Command, put: Put, tmp_path: Path) -> None:
+def test_restore_undoes_apply_from_the_cache_and_from_a_backup(
+    command: Command, put: Put, tmp_path: Path
+) -> None:
     camera = small()
     before = camera.ext_values
     url = put(camera)
+    assert command("restore", url, *CAMERA).code == 5
     file, backup = tmp_path / "camera.json", tmp_path / "before.json"
-    file.write_text(
-        '{"paramclient": 1, "sets": [{"extended": true, "component": 100, "params": {'
-        '"CAM_NAME": {"value": "Rear", "type": "CUSTOM"},'
-        '"CAM_KEY": {"value": "hex:01", "type": "CUSTOM"}}}]}'
-    )
-    assert command("apply", url, file, *CAMERA, "--backup", backup).code == 0
-    assert camera.ext_values["CAM_NAME"] == "Rear"
-    again = command("apply", url, file, *CAMERA, "--backup", backup)
-    assert (again.code, "exists" in again.err) == (2, True)
-    command("set", url, *CAMERA, "CAM_MODE", 7)
-    restored = command("restore", url, backup, *CAMERA)
-    assert (restored.code, camera.ext_values) == (0, before), restored.err
-
-
-def test_restore_from_the_cache(command: Command, put: Put, tmp_path: Path) -> None:
-    camera = small()
-    before = camera.ext_values
-    url = put(camera)
-    empty = command("restore", url, *CAMERA)
-    assert (empty.code, "no snapshot from before an apply" in empty.err) == (5, True), empty.err
-    file = tmp_path / "camera.json"
     file.write_text(EXT_FILE % "Rear")
-    assert command("apply", url, file, *CAMERA).code == 0
+    assert command("apply", url, file, *CAMERA, "--backup", backup).code == 0
     [kept] = command("history", 1, "--extended", "--snapshots").rows[1:]
     assert (kept[0], kept[2:4], kept[-1]) == ("1", ["100", "4"], "before apply")
-    dry = command("restore", url, *CAMERA, "--dry-run")
-    assert (dry.code, dry.rows[1][:3]) == (0, ["CAM_NAME", "Rear", "Front"])
-    assert "the state: 4 extended parameters of 1/100 no autopilot from snapshot 1 of " in dry.err
     restored = command("restore", url, *CAMERA)
     assert (restored.code, camera.ext_values) == (0, before), restored.err
     assert restored.rows[1:] == [["CAM_NAME", "Rear", "Front", "Front", "accepted"]]
-    again = command("restore", url, *CAMERA)
-    assert again.code == 2
-    assert "a restore ran " in again.err
     undone = command("restore", url, 2, *CAMERA)
     assert (undone.code, camera.ext_values["CAM_NAME"]) == (0, "Rear"), undone.err
-    assert command("restore", url, 99, *CAMERA).code == 5
-    assert command("restore", put(small()), *CAMERA, "--no-cache").code == 2
-
-
-def test_a_cached_table_is_applied(command: Command, put: Put) -> None:
-    camera = small()
-    url = put(camera)
-    assert command("fetch", url, *CAMERA).code == 0
-    camera.set_ext_param("CAM_NAME", "Rear")
-    done = command("apply", url, "cache:1", *CAMERA)
-    assert (done.code, camera.ext_values["CAM_NAME"]) == (0, "Front"), done.err
+    assert (command("restore", url, backup, *CAMERA).code, camera.ext_values) == (0, before)
 
 
 def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put) -> None:
@@ -194,7 +132,6 @@ def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put
     assert command("show", 1, "CAM_NAME", "--extended").rows[1][:3] == ["CAM_NAME", "Front", "CUSTOM"]
     [table] = command("show", 1, "--extended", "--json").json["components"]
     assert table["params"]["CAM_MODE"]["value"] == 1
-    assert command("show", 1, "NO_SUCH", "--extended").code == 2
     assert command("show", "1/1", "--extended").code == 5
     assert command("diff", 1, url, *CAMERA).code == 0
 
@@ -207,12 +144,7 @@ def test_the_history_of_extended_parameters(command: Command, put: Put) -> None:
         ["100", "CAM_NAME", "Front", "Rear", "us"],
         ["100", "CAM_KEY", "hex:ff00fe", "hex:01", "us"],
     ]
-    assert len(command("history", 1, "CAM_NAME", "--extended").rows) == 2
-    document = command("history", 1, "--extended", "--json").json
-    assert [(each["name"], each["new"]) for each in document["history"][-1:]] == [("CAM_KEY", "hex:01")]
-    assert command("history", 1, "--extended", "--snapshots").rows[1:] == []
-    assert len(command("history", 1, "cam_*", "--extended").rows) == 3
-    assert command("history", 1, "NO_SUCH", "--extended").code == 2
+    assert len(command("history", 1, "cam_n*", "--extended").rows) == 2
     assert command("history", 1).rows[1:] == []
 
 
@@ -230,12 +162,14 @@ class Changing(Camera):
                 self.receive(messages.encode(request, system=254, component=190, sequence=0), now)
 
 
-def changing() -> Camera:
-    return Changing({"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe"})
-
-
 def test_watch_prints_changes(command: Command, put: Put) -> None:
-    watched = command("watch", put(changing()), *CAMERA, "--timeout", 10)
+    watched = command(
+        "watch",
+        put(Changing({"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe"})),
+        *CAMERA,
+        "--timeout",
+        10,
+    )
     assert (watched.code, watched.err) == (0, "watching 3 extended parameters of 1/100 camera\n")
     assert [line.split("  ", 1)[1] for line in watched.out.splitlines()] == [
         "CAM_NAME  Front -> Rear  (vehicle)",

@@ -85,6 +85,7 @@ def test_a_text_that_is_neither_a_number_nor_a_known_name_is_quoted(command: Com
     outcome = command("set", "sim:px4", "MC_ROLL_P=6,5")
     assert outcome.code == 2
     assert "MC_ROLL_P: '6,5' is not a number. 1/1 px4 does not describe its parameters" in outcome.err
+    assert "https://autotest.ardupilot.org/Parameters/" in outcome.err
 
 
 @pytest.mark.parametrize("timeout", [[], ["--timeout", "60"]])
@@ -106,6 +107,9 @@ def test_the_comparison_of_a_short_file_with_a_whole_table_mentions_partial(comm
     assert command("diff", "quad.parm", "sim:px4").err.endswith(hint)
     assert command("diff", "sim:px4", "quad.parm").err.endswith(hint)
     assert hint not in command("diff", "sim:px4", "quad.parm", "--partial").err
+    Path("few.parm").write_text("MC_ROLL_P 4.0\n", encoding="utf-8")
+    assert command("diff", "few.parm", "sim:px4", "--partial").code == 0
+    assert command("diff", "sim:px4", "few.parm", "--partial").code == 0
     assert command("save", "sim:px4", "whole.parm").code == 0
     assert "--partial" not in command("diff", "whole.parm", "quad.parm").err
     assert "--partial" not in command("diff", "whole.parm", "sim:px4").err

@@ -102,12 +102,13 @@ def test_a_terminal_shows_what_is_awaited(
     assert texts[-2].startswith("waiting for an autopilot on sim:custom (3 s). ")
     assert len(texts) == 7, "six times, and the erasure with the error after it"
     assert texts[-1].startswith("paramclient: no reply: ")
-    silent = drawn(command("get", put(Deaf(table={"A": 1})), "A").err)
-    assert silent[0] == "waiting for A of 1/1 px4 (0 s)."
-    fetched = drawn(command("fetch", put(Deaf(table={"A": 1}))).err)
-    assert any(each.startswith("fetching 1/1 px4: waiting for the first response (") for each in fetched)
-    written = drawn(command("set", put(Deaf(table={"A": 1})), "A", 2).err)
-    assert written[0] == "waiting for 1/1 px4 to acknowledge PARAM_SET (0 s)."
+    for words, shown in (
+        (["get", "A"], "waiting for A of 1/1 px4 (0 s)."),
+        (["fetch"], "fetching 1/1 px4: waiting for the first response (0 s)."),
+        (["set", "A", 2], "waiting for 1/1 px4 to acknowledge PARAM_SET (0 s)."),
+    ):
+        done = command(words[0], put(Deaf(table={"A": 1})), *words[1:])
+        assert drawn(done.err)[0] == shown
 
 
 def test_a_quick_response_leaves_the_terminal_alone(

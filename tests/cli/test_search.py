@@ -26,9 +26,8 @@ def test_search_finds_names_descriptions_and_value_names(command: Command) -> No
     found = command("search", "ROLL", "gain", "--json")
     assert found.code == 0
     first = found.json["results"][0]
-    assert first["name"].startswith("MC_ROLL")
+    assert (first["name"], len(first["vehicles"])) == ("MC_ROLL_P", 1)
     assert "roll" in first["description"].lower()
-    assert len(first["vehicles"]) == 1
     by_name = command("search", "mc_roll_p")
     assert by_name.rows[1][:3] == ["MC_ROLL_P", "7.5", "1/1"]
     assert command("search", "ROLL gain", "--json").json == found.json  # words in quotes
@@ -47,7 +46,6 @@ def test_search_reports_that_nothing_was_found(command: Command) -> None:
     assert "only names of 2/1 ardupilot were searched: `paramclient fetch LINK --metadata " in nothing.err
     of_described = command("search", "xyzzy", "--vehicle", 1)
     assert of_described.err == "paramclient: nothing found; 903 parameters searched\n"
-    assert command("search", "xyzzy", "--json").json == {"results": []}
 
 
 def test_search_prints_a_value_that_all_vehicles_have_and_the_number_of_different_ones(
@@ -68,8 +66,6 @@ def test_a_camera_needs_no_metadata(command: Command) -> None:
     assert command("get", "sim:px4?metadata=1", "MC_ROLL_P", "--metadata", "vehicle").code == 0
     found = command("search", "roll")
     assert (found.code, found.err) == (0, "")
-    assert command("fetch", "sim:ardupilot").code == 0
-    assert command("search", "roll").err.startswith("only names of 1/1 ardupilot were searched: ")
 
 
 @pytest.mark.usefixtures("tables")

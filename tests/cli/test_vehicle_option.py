@@ -1,19 +1,22 @@
-"""--vehicle: a vehicle of a link by address or hardware id, all of them, and vehicles of the cache."""
+"""--vehicle: a vehicle of a link by address or hardware id, or all of them; and vehicles of the cache."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
+from paramclient import read_file
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.commands import Command, Put, strict
+from tests.shell import Tap
 
-URL = "sim:custom"
-TABLE: dict[str, Any] = {"A": 1.0, "B": 2.0}
+URL = "udpin:0.0.0.0:14550"
+TABLE: dict[str, Any] = {"A": 1.0, "B": 2}
 UID = "0a" * 18
 
 
@@ -23,6 +26,9 @@ def px4(system: int = 1, **options: Any) -> PX4Vehicle:
 
 def copter(system: int = 4, **options: Any) -> ArduPilotVehicle:
     return ArduPilotVehicle(system=system, live=(), **{"table": TABLE} | options)
+
+
+# One vehicle
 
 
 @pytest.mark.parametrize("name", ["4", "4/1", f"uid:{UID}", "UID:0A0A0A"])
@@ -38,7 +44,7 @@ def test_another_vehicle_under_the_system_id_is_not_written_to(command: Command,
     done = command("set", put(other), "A", 7, "--vehicle", f"uid:{UID}", "--timeout", 5)
     assert (done.code, done.out, other.requests["PARAM_SET"]) == (3, "", 0)
     assert f"a vehicle with hardware id {UID}" in done.err
-    assert "Heard on sim:custom so far: 4/1 ArduPilot quadrotor." in done.err
+    assert "Heard on udpin:0.0.0.0:14550 so far: 4/1 ArduPilot quadrotor." in done.err
 
 
 def test_two_vehicles_with_the_same_beginning_of_the_hardware_id(command: Command, put: Put) -> None:
@@ -49,18 +55,11 @@ def test_two_vehicles_with_the_same_beginning_of_the_hardware_id(command: Comman
     assert (one.requests["PARAM_SET"], two.requests["PARAM_SET"]) == (0, 0)
 
 
-def test_a_component_of_a_vehicle(command: Command, put: Put) -> None:
-    camera = GenericVehicle({"A": 5}, system=4, component=100)
-    done = command("get", put(Air([px4(), copter(), camera])), "A", "--json", "--vehicle", "4/100")
-    assert done.json["params"]["A"]["value"] == 5
-
-
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
         ("4/300", "ids are 1 to 255, component ids 0 to 255"),
         ("0", "ids are 1 to 255, component ids 0 to 255"),
-        ("tractor", "a vehicle is written as 4, as 4/1"),
         ("px4", "a vehicle is written as 4, as 4/1"),
         ("uid:0a0a", "a vehicle is written as 4, as 4/1"),
         ("", "a vehicle is written as 4, as 4/1"),
@@ -72,42 +71,94 @@ def test_names_that_name_nothing(command: Command, put: Put, name: str, reason: 
     assert reason in tried.err
 
 
-def test_subcommands_for_one_vehicle_refuse_all(command: Command, put: Put, tmp_path: Path) -> None:
-    vehicle = px4()
-    url = put(vehicle)
+def test_a_read_says_which_vehicle_it_shows(command: Command, put: Put) -> None:
+    """Without an option, the first vehicle received is read, which may be another one next time."""
+    url = put(Air([px4(), copter()]))
+    several = command("fetch", url)
+    assert several.rows[0][0] == "vehicle"
+    assert re.search(
+        r"[14]/1 \w+ was used, the first vehicle heard\. Also on this link: [14]/1 \w+ quadrotor\. "
+        r"--vehicle chooses one\n",
+        several.err,
+    )
+    named = command("fetch", url, "--vehicle", 1)
+    assert (named.rows[0][0], "Also on this link" in named.err) == ("name", False)
+
+
+def test_own_system_id(command: Command, put: Put) -> None:
+    tap = Tap(px4())
+    assert command("get", put(tap), "A", "--source-system", "244").code == 0
+    assert {(frame.system, frame.component) for _, frame, _ in tap.received} == {(244, 190)}
+
+
+# All vehicles
+
+
+def test_check_refuses_all(command: Command, put: Put) -> None:
+    url = put(vehicle := px4())
     assert command("check", url, "--vehicle", "all").code == 2
     assert not vehicle.requests
 
 
-def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:
-    for vehicle in (px4(), copter(), copter(5, uid2=bytes([7] * 18))):
-        assert command("fetch", put(vehicle)).code == 0
-    assert command("show", "px4", "--json").json["components"][0]["system"] == 1
-    assert command("show", "4/1", "--json").json["components"][0]["system"] == 4
-    several = command("show", "ardupilot")
-    assert (several.code, several.err.count("\n  ")) == (2, 2)
-    assert "fits 2 vehicles in the cache" in several.err
-    missing = command("show", "4/9")
-    assert missing.code == 2
-    assert "no vehicle has system id 4 and a table of component 9" in missing.err
+def test_get_and_fetch_read_every_vehicle(command: Command, put: Put) -> None:
+    url = put(Air([px4(table=TABLE | {"OF_PX4": 1.5}), copter()]))
+    read = command("get", url, "A", "--vehicle", "all")
+    assert (read.code, read.err) == (0, "")
+    assert read.words[0] == ["vehicle", "name", "value", "type", "index"]
+    assert [line[:3] for line in read.words[1:]] == [["1/1", "A", "1.0"], ["4/1", "A", "1.0"]]
+    read = command("get", url, "OF_*", "--vehicle", "all", "--json")
+    first, second = read.json["vehicles"]
+    assert first["params"]["OF_PX4"]["value"] == 1.5
+    assert (read.code, second["params"], [*second["errors"]]) == (2, {}, ["OF_*"])
+    assert "4/1 ardupilot: " in read.err
+    fetched = command("fetch", url, "A", "--vehicle", "all")
+    assert [line[:3] for line in fetched.words[1:]] == [["1/1", "A", "1.0"], ["4/1", "A", "1.0"]]
+    assert len(re.findall(r" bytes received, [0-9,]+ sent on the whole link", fetched.err)) == 2
 
 
-def test_reset_writes_to_every_vehicle(command: Command, put: Put, tmp_path: Path) -> None:
+def test_one_vehicle_that_fails_stops_no_other(command: Command, put: Put) -> None:
+    class Mute(PX4Vehicle):
+        """A vehicle that receives nothing."""
+
+        def receive(self, data: bytes, now: float) -> None:
+            """Lose what is sent to the vehicle."""
+
+    url = put(Air([px4(), Mute(system=3, table=TABLE)]))
+    read = command("get", url, "A", "--vehicle", "all", "--timeout", "20")
+    assert read.code == 3
+    assert [line[:2] for line in read.words[1:]] == [["1/1", "A"]]
+    assert "3/1 px4: " in read.err
+
+
+def test_set_and_reset_write_to_every_vehicle(command: Command, put: Put, tmp_path: Path) -> None:
+    vehicles = px4(table=TABLE | {"OF_PX4": 1.5}), copter(ftp=False)
+    url = put(Air(vehicles))
+    written = command("set", url, "A", "7", "OF_PX4", "2", "--vehicle", "all", "--json")
+    assert written.code == 2
+    first, second = written.json["vehicles"]
+    assert [each["vehicle"]["kind"] for each in (first, second)] == ["PX4 quadrotor", "ArduPilot quadrotor"]
+    assert [each["status"] for each in first["results"]] == ["accepted", "accepted"]
+    assert [each["status"] for each in second["results"]] == ["accepted", "refused"]
     described = tmp_path / "parameters.json"
     described.write_text('{"version": 1, "parameters": [{"name": "A", "type": "Float", "default": 2.5}]}')
-    vehicles = (px4(), px4(4))
-    words = ["reset", put(Air(vehicles)), "A", "--metadata", described, "--vehicle", "all"]
-    done = command(*words)
-    assert done.code == 0, done.err
+    done = command("reset", url, "A", "--metadata", described, "--vehicle", "all")
     assert [row[:5] for row in done.rows] == [
         ["vehicle", "name", "before", "wanted", "now"],
-        *([address, "A", "1.0", "2.5", "2.5"] for address in ("1/1", "4/1")),
+        *([address, "A", "7.0", "2.5", "2.5"] for address in ("1/1", "4/1")),
     ]
     assert [each.values["A"] for each in vehicles] == [2.5, 2.5]
-    again = command(*words, "--json").json
-    assert [(each["system"], each["counts"]) for each in again["vehicles"]] == [
-        (number, {"unchanged": 1}) for number in (1, 4)
-    ]
+
+
+def test_save_writes_every_vehicle_into_one_file_or_into_one_each(
+    command: Command, put: Put, tmp_path: Path
+) -> None:
+    url = put(Air([px4(), copter()]))
+    assert command("save", url, tmp_path / "fleet.json", "--vehicle", "all").code == 0
+    assert [each.system for each in read_file(tmp_path / "fleet.json").sets] == [1, 4]
+    saved = command("save", url, tmp_path / "quad-{system}.param", "--vehicle", "all", "--json")
+    paths = [tmp_path / f"quad-{system}.param" for system in (1, 4)]
+    assert [each["path"] for each in saved.json["files"]] == [*map(str, paths)]
+    assert all("A" in read_file(path).choose() for path in paths)
 
 
 def test_watch_prints_the_changes_of_every_vehicle(command: Command, put: Put) -> None:
@@ -123,21 +174,57 @@ def test_watch_prints_the_changes_of_every_vehicle(command: Command, put: Put) -
                 self.changes_at = math.inf
                 self.set_param("A", 3.0)
 
-    url = put(Air([Changing(table=TABLE), Changing(system=2, table=TABLE)]))
-    watched = command("watch", url, "A", "--vehicle", "all", "--timeout", 20)
-    assert watched.code == 0, watched.err
-    assert sorted(re.sub(r"^\S+  ", "", line) for line in watched.out.splitlines()) == [
+    def watch(*words: str) -> list[str]:
+        url = put(Air([Changing(table=TABLE), Changing(system=2, table=TABLE)]))
+        watched = command("watch", url, "A", "--vehicle", "all", "--timeout", 20, *words)
+        assert watched.code == 0, watched.err
+        return watched.out.splitlines()
+
+    assert sorted(line.partition("  ")[2] for line in watch()) == [
         "1/1 px4: A  1.0 -> 3.0  (vehicle)",
         "2/1 px4: A  1.0 -> 3.0  (vehicle)",
     ]
-    url = put(Air([Changing(table=TABLE), Changing(system=2, table=TABLE)]))
-    lines = command("watch", url, "A", "--vehicle", "all", "--timeout", 20, "--json").out.splitlines()
-    assert {(strict(line)["system"], strict(line)["name"]) for line in lines} == {(1, "A"), (2, "A")}
+    assert {strict(line)["system"] for line in watch("--json")} == {1, 2}
 
 
-def test_a_read_says_which_vehicle_it_shows(command: Command, put: Put) -> None:
-    url = put(Air([px4(), copter()]))
-    several = command("fetch", url)
-    assert several.words[0][:2] == ["vehicle", "name"]
-    assert {row[0] for row in several.words[1:]} <= {"1/1", "4/1"}
-    assert command("fetch", url, "--vehicle", 1).words[0][0] == "name"
+# Vehicles of the cache
+
+
+def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:
+    for vehicle in (px4(), copter(), copter(5, uid2=bytes([7] * 18))):
+        assert command("fetch", put(vehicle)).code == 0
+    assert [row[0] for row in command("show").rows] == ["component", "5/1", "4/1", "1/1"]
+    assert command("show", "px4", "--json").json["components"][0]["system"] == 1
+    assert command("show", "4/1", "--json").json["components"][0]["system"] == 4
+    several = command("show", "ardupilot")
+    assert (several.code, several.err.count("\n  ")) == (2, 2)
+    assert "fits 2 vehicles in the cache" in several.err
+    missing = command("show", "4/9")
+    assert missing.code == 2
+    assert "no vehicle has system id 4 and a table of component 9" in missing.err
+
+
+# Values that are probably wrong
+
+
+@pytest.mark.parametrize(("name", "value"), [("A", "11"), ("B", "3.5")], ids=["range", "fraction"])
+def test_a_doubtful_value_is_written_only_after_a_question(
+    command: Command, put: Put, at_terminal: Callable[[str], None], tmp_path: Path, name: str, value: str
+) -> None:
+    vehicle = copter()
+    described = tmp_path / "parameters.json"
+    described.write_text(
+        '{"version": 1, "parameters": [{"name": "A", "type": "Float", "min": 0, "max": 10}]}'
+    )
+    words = ("set", put(vehicle), name, value, "--metadata", described)
+    before = dict(vehicle.values)
+    refused = command(*words)
+    assert (refused.code, vehicle.values) == (2, before)
+    assert ("above the maximum of 10" if name == "A" else "not a whole number") in refused.err
+    assert "--force" in refused.err
+    for answer, is_written in (("n", False), ("y", True)):
+        at_terminal(answer)
+        asked = command(*words)
+        assert "Write these values to 4/1 ArduPilot quadrotor, firmware " in asked.err
+        assert (asked.code == 0, vehicle.values != before) == (is_written, is_written)
+    assert "[y/N]" not in command(*words, "--force").err
