@@ -15,9 +15,10 @@ from paramclient.errors import FileError, PackError, UsageError
 from paramclient.files import json_format, lists
 from paramclient.files.disk import LARGEST_FILE, read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, format_of_name
-from paramclient.files.reading import Reading, time_of
+from paramclient.files.reading import Reading
 from paramclient.model.identity import autopilot_name, version_text
 from paramclient.model.names import counted, first_of
+from paramclient.model.notation import time_text
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, bits_of, check_name, from_bits, same_bits
 from paramclient.protocol import param_pck
@@ -298,7 +299,7 @@ def _header_lines(params: ParamSet) -> Iterator[str]:
         firmware = f", firmware {version_text(identity.firmware)}{commit}" if identity.firmware else ""
         yield f"of the vehicle {identity.key}{firmware}"
     if params.at is not None:
-        yield f"as of {time_of(params.at, 'seconds')}"
+        yield f"as of {time_text(params.at, 'seconds')}"
     if params.source:
         yield f"from {params.source}"
 

@@ -26,9 +26,9 @@ from typing import Any, Final, NoReturn, TypeAlias
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import FileFormat, ParamFile
-from paramclient.files.reading import Reading, as_type, excerpt, is_plain, time_of, undecoded_byte
+from paramclient.files.reading import Reading, as_type, excerpt, is_plain, undecoded_byte
 from paramclient.model.identity import Identity
-from paramclient.model.notation import bits_written, value_written
+from paramclient.model.notation import bits_written, time_text, value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import (
     HEX,
@@ -340,7 +340,7 @@ def _set_fields(params: ParamSet) -> dict[str, object]:
             "system": params.system,
             "component": params.component,
             "extended": params.is_extended or None,
-            "at": None if params.at is None else time_of(params.at),
+            "at": None if params.at is None else time_text(params.at, "auto"),
             "source": _encodable(params.source) or None,
             "identity": None if params.identity is None else asdict(params.identity),
             "params": {param.name: json_fields(params, param) for param in params.values()},

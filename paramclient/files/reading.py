@@ -7,7 +7,6 @@ import math
 import re
 import struct
 from collections.abc import Iterable, Iterator
-from datetime import UTC, datetime
 from functools import cached_property
 from typing import Final, NamedTuple
 
@@ -288,19 +287,6 @@ def value_text(param: WrittenParam) -> str:
     if not is_plain(value):
         raise UsageError(f"{param.name} is a NaN with payload bits; json can keep them")
     return str(value_written(value, param))
-
-
-def time_of(at: float, digits: str = "auto") -> str:
-    """Return a Unix time in ISO 8601, UTC.
-
-    Raises:
-        UsageError: the time is outside the range of the calendar.
-    """
-    try:
-        moment = datetime.fromtimestamp(at, UTC)
-    except (ArithmeticError, OSError, ValueError):
-        raise UsageError(f"{at!r} is not a valid Unix time in seconds") from None
-    return moment.isoformat(timespec=digits).replace("+00:00", "Z")
 
 
 def is_plain(value: float) -> bool:

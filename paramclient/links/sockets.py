@@ -319,7 +319,7 @@ def _usual_port(address: Address) -> int:
 
 
 _NO_ROUTE = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN)
-_DELAYED = (errno.ECONNREFUSED, errno.ECONNRESET, errno.ENETRESET, *_NO_ROUTE)
+_DELAYED = (errno.ECONNREFUSED, errno.ECONNRESET, errno.ENETRESET, errno.EHOSTDOWN, *_NO_ROUTE)
 """Errors of earlier datagrams, which the operating system reports on receiving."""
 _LARGEST_DATAGRAM = 65535
 _SO_RCVBUFFORCE = 33  # Linux, asm-generic/socket.h; the socket module has no name for it

@@ -63,9 +63,17 @@ def hash_text(crc: int | None) -> str | None:
     return None if crc is None else f"{crc:08x}"
 
 
-def time_text(at: float) -> str:
-    """Return a Unix time in ISO 8601, UTC, with milliseconds."""
-    return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+def time_text(at: float, digits: str = "milliseconds") -> str:
+    """Return a Unix time in ISO 8601, UTC.
+
+    Raises:
+        UsageError: the time is outside the range of the calendar.
+    """
+    try:
+        moment = datetime.fromtimestamp(at, UTC)
+    except (ArithmeticError, OSError, ValueError):
+        raise UsageError(f"{at!r} is not a valid Unix time in seconds") from None
+    return moment.isoformat(timespec=digits).replace("+00:00", "Z")
 
 
 def time_or_none(at: float | None) -> str | None:

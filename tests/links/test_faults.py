@@ -6,6 +6,7 @@ import asyncio
 import errno
 import os
 import socket
+from collections.abc import Callable
 from typing import Any
 
 import anyio
@@ -22,32 +23,24 @@ HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190,
 GONE = [errno.ENETDOWN, errno.ENETUNREACH, errno.EADDRNOTAVAIL, errno.EINVAL]
 
 
-class Net:
-    """A network that can be disconnected; then sending a datagram fails with the given error."""
-
-    reason: int | None = None
-
-    def check(self) -> None:
-        if self.reason is not None:
-            raise OSError(self.reason, os.strerror(self.reason))
-
-
 @pytest.fixture
-def net(monkeypatch: pytest.MonkeyPatch) -> Net:
-    """The network of all sockets."""
-    net = Net()
+def errors(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[int]]:
+    """The errors that the next calls of sockets raise, by the name of the call."""
+    errors: dict[str, list[int]] = {"sendto": [], "recvfrom_into": []}
+    real = socket.socket
 
-    class Socket(socket.socket):
-        def send(self, *arguments: Any) -> int:
-            net.check()
-            return super().send(*arguments)
+    def faulty(call: str) -> Callable[..., object]:
+        def called(sock: socket.socket, *arguments: Any) -> object:
+            if errors[call]:
+                number = errors[call].pop(0)
+                raise OSError(number, os.strerror(number))
+            return getattr(real, call)(sock, *arguments)
 
-        def sendto(self, *arguments: Any) -> int:
-            net.check()
-            return super().sendto(*arguments)
+        return called
 
-    monkeypatch.setattr(socket, "socket", Socket)
-    return net
+    calls = {call: faulty(call) for call in errors}
+    monkeypatch.setattr(socket, "socket", type("Faulty", (socket.socket,), calls))
+    return errors
 
 
 def listening(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
@@ -64,48 +57,34 @@ async def failure(link: Link) -> LinkError:
     return caught.value
 
 
-# Network outages
-
-
 @pytest.mark.parametrize("reason", GONE)
 @pytest.mark.asyncio
-async def test_a_short_network_outage_loses_only_sent_datagrams(net: Net, reason: int) -> None:
+async def test_a_short_network_outage_loses_only_sent_datagrams(
+    errors: dict[str, list[int]], reason: int
+) -> None:
     with listening() as vehicle:
         link: Any = create_link(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}")
         await link.open()
-        for number in range(3):
-            net.reason = reason
-            await link.send(b"lost", None)
-            net.reason = None
-            await link.send(bytes([number]), None)
-            assert vehicle.recv(10) == bytes([number])
+        errors["sendto"].append(reason)
+        await link.send(b"lost", None)
+        await link.send(b"1", None)
+        assert vehicle.recv(10) == b"1"
         await link.close()
 
 
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])
 @pytest.mark.asyncio
-async def test_a_failed_socket_is_reopened(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_failed_socket_is_reopened(kind: str, errors: dict[str, list[int]]) -> None:
     """For every error of the operating system; delayed errors of earlier datagrams are skipped."""
-    script: list[int] = []
-
-    class Faulty(socket.socket):
-        def recvfrom_into(self, *arguments: Any) -> Any:
-            if script:
-                number = script.pop(0)
-                raise OSError(number, os.strerror(number))
-            return super().recvfrom_into(*arguments)
-
-    with listening() as far, monkeypatch.context() as patch:
-        patch.setattr(socket, "socket", Faulty)
+    with listening() as far:
         port = far.getsockname()[1]
         link: Any = create_link("udpin:127.0.0.1:0" if kind == "udpin" else f"udpout:127.0.0.1:{port}")
         assert link.reconnects
         await link.open()
-        script += [errno.ECONNRESET, errno.ECONNREFUSED, errno.ENETRESET]
+        errors["recvfrom_into"] += [errno.ECONNRESET, errno.ECONNREFUSED, errno.ENETRESET]
         far.sendto(HEARTBEAT, link.address)
-        [(_, data)] = await link.receive()
-        assert data == HEARTBEAT
-        script.append(errno.EIO)
+        assert [data for _, data in await link.receive()] == [HEARTBEAT]
+        errors["recvfrom_into"].append(errno.EIO)
         far.sendto(HEARTBEAT, link.address)
         assert "cannot receive: Input/output error" in str(await failure(link))
         await link.open()
