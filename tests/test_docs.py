@@ -130,6 +130,14 @@ def test_the_pages_are_few_and_short() -> None:
     assert sum(words.values()) <= 25_000
 
 
+def test_the_files_that_the_internals_name_exist() -> None:
+    named = re.findall(r"`([\w/]+\.(?:py|toml|yml))`", (DOCS / "internals.md").read_text(encoding="utf-8"))
+    assert len(named) > 30
+    assert [
+        each for each in named if not any((ROOT / "paramclient").rglob(each)) and not (ROOT / each).exists()
+    ] == []
+
+
 def test_the_reference_is_that_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(DOCS)
     import reference
