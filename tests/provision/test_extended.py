@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from paramclient import (
-    NoReply,
-    ParamCache,
-    ParamSet,
-    ParamType,
-    UsageError,
-    Value,
-    VehicleArmed,
-    WrittenParam,
-)
+from paramclient import NoReply, ParamCache, ParamSet, ParamType, UsageError, VehicleArmed
 from paramclient.files import read_file
-from paramclient.provision import ApplyStatus, apply, plan, restore
+from paramclient.provision import ApplyResult, ApplyStatus, Plan, apply, plan, restore
 from paramclient.provision.apply_restore import load_restore_point
 from paramclient.sim import Air, Camera, PX4Vehicle
-from tests.shell import a_client, in_simulated_time
+from tests.shell import a_client
 
 
 def small() -> Camera:
@@ -31,55 +23,52 @@ def small() -> Camera:
     )
 
 
-def wanted(camera: Camera, **values: Value) -> ParamSet:
-    """The set of a camera with some values changed."""
-    other = Camera({name: (param.type, param.value) for name, param in camera.ext_params.items()})
-    for name, value in values.items():
-        other.set_ext_param(name, value)
-    return ParamSet({name: other.ext_params[name] for name in values}, is_extended=True)
+def statuses(found: Plan | ApplyResult) -> dict[str, str]:
+    return {name: str(row.status) for name, row in found.rows.items()}
 
 
-@in_simulated_time
 async def test_a_plan_names_what_cannot_be_written() -> None:
-    camera = small()
-    async with a_client(camera) as client:
-        ext = (await client.component(1, 100)).ext
-        content = wanted(camera, MODE=2, NAME="Front", KEY=b"\1")
-        more = {name: WrittenParam(name, "x", ParamType.CUSTOM) for name in ("LOST", "EV")}
-        made = await plan(ext, ParamSet({**content.params, **more}, is_extended=True))
-        assert {name: row.status.value for name, row in made.rows.items()} == {
+    async with a_client(camera := small()) as client:
+        component = await client.component(1, 100)
+        made = await plan(
+            component.ext,
+            {"MODE": 2, "NAME": "Front", "KEY": b"\1", "LOST": "x", "EV": "x", "CLOCK": 2**62 + 1},
+        )
+        assert statuses(made) == {
             "MODE": "set",
             "NAME": "unchanged",
             "KEY": "set",
             "LOST": "skipped",
             "EV": "invalid",
+            "CLOCK": "unchanged",
         }
-        assert (await plan(ext, wanted(camera, NAME="Front", KEY=b"\xff\0\xfe"))).complete
         assert camera.ext_values["MODE"] == 1
-        with pytest.raises(UsageError, match="of component 101, not of component 100"):
-            await plan(ext, ParamSet({}, component=101, is_extended=True))
-        with pytest.raises(UsageError, match="are extended ones, and plain ones are needed"):
-            await apply(await client.component(1, 100), content)
-        with pytest.raises(UsageError, match="are plain ones, and extended ones are needed"):
-            await apply(ext, ParamSet(content.params))
+        for target, wanted, why in (
+            (component.ext, ParamSet({}, component=101, is_extended=True), "101, not of component 100"),
+            (
+                component,
+                ParamSet({"MODE": 2}, is_extended=True),
+                "are extended ones, and plain ones are needed",
+            ),
+            (component.ext, ParamSet({"MODE": 2}), "are plain ones, and extended ones are needed"),
+        ):
+            with pytest.raises(UsageError, match=why):
+                await apply(target, wanted)
 
 
-@in_simulated_time
 async def test_values_are_written_verified_and_restored(tmp_path: Path) -> None:
     camera = small()
     before = camera.ext_values
+    wanted: dict[str, Any] = {"MODE": 2, "NAME": "Rear", "KEY": b"\1", "CLOCK": 2**62 + 3}
     with ParamCache(tmp_path / "cache.sqlite3") as cache:
         async with a_client(camera, cache=cache) as client:
             ext = (await client.component(1, 100)).ext
-            content = wanted(camera, MODE=2, NAME="Rear", KEY=b"\1", CLOCK=2**62 + 3)
-            result = await apply(ext, content, backup=tmp_path / "before.json")
-            assert result.complete
-            assert set(result.counts) == {ApplyStatus.ACCEPTED}
-            assert camera.ext_values == before | {"MODE": 2, "NAME": "Rear", "KEY": b"\1", "CLOCK": 2**62 + 3}
+            result = await apply(ext, wanted, backup=tmp_path / "before.json")
+            assert set(statuses(result).values()) == {"accepted"}
+            assert camera.ext_values == before | wanted
             (backup,) = read_file(tmp_path / "before.json").sets
             assert {name: param.value for name, param in backup.items()} == before
-            again = await apply(ext, content)
-            assert set(again.counts) == {ApplyStatus.UNCHANGED}
+            assert set(statuses(await apply(ext, wanted)).values()) == {"unchanged"}
             await ext.set("NAME", "Top")
             await ext.core.cache_writer.write_all()
             key = ext.identity.key
@@ -95,39 +84,27 @@ async def test_values_are_written_verified_and_restored(tmp_path: Path) -> None:
             assert camera.ext_values["NAME"] == "Top"
 
 
-@in_simulated_time
 async def test_adjusted_and_refused_values_are_reported() -> None:
-    camera = small()
-    async with a_client(camera) as client:
-        result = await apply(
-            (await client.component(1, 100)).ext, wanted(camera, MODE=9, EV=0.75, NAME="Rear")
-        )
-        statuses = {name: row.status for name, row in result.rows.items()}
-        assert statuses == {
-            "MODE": ApplyStatus.ADJUSTED,
-            "EV": ApplyStatus.REFUSED,
-            "NAME": ApplyStatus.ACCEPTED,
-        }
-        assert (result.complete, result.error, result.rows["MODE"].actual) == (False, None, 5)
-
-
-@in_simulated_time
-async def test_the_timeout_ends_the_run_with_the_rows_so_far() -> None:
-    camera = Camera({"A": 1, "B": 2}, slow={"B": 9.0})
-    async with a_client(camera) as client:
+    async with a_client(small()) as client:
         ext = (await client.component(1, 100)).ext
-        result = await apply(ext, wanted(camera, A=5, B=6), timeout=4.0)
-        assert isinstance(result.error, NoReply)
-        assert result.rows["A"].status is ApplyStatus.UNPROVEN
-        assert not result.complete
+        result = await apply(ext, {"MODE": 9, "EV": 0.75, "NAME": "Rear"})
+    assert statuses(result) == {"MODE": "adjusted", "EV": "refused", "NAME": "accepted"}
+    assert (result.complete, result.error, result.rows["MODE"].actual) == (False, None, 5)
 
 
-@in_simulated_time
+async def test_the_timeout_ends_the_run_with_the_rows_so_far() -> None:
+    async with a_client(Camera({"A": 1, "B": 2}, slow={"B": 9.0})) as client:
+        result = await apply((await client.component(1, 100)).ext, {"A": 5, "B": 6}, timeout=4.0)
+    assert isinstance(result.error, NoReply)
+    assert result.rows["A"].status is ApplyStatus.UNPROVEN
+    assert result.rows["A"].type is ParamType.INT32
+    assert not result.complete
+
+
 async def test_nothing_is_set_on_the_camera_of_an_armed_vehicle_unless_allowed() -> None:
-    camera = small()
-    async with a_client(Air.symmetric([PX4Vehicle(table={"A": 1}, armed=True), camera])) as client:
+    async with a_client(Air.symmetric([PX4Vehicle(table={"A": 1}, armed=True), small()])) as client:
         await client.component(1, 1)
         ext = (await client.component(1, 100)).ext
         with pytest.raises(VehicleArmed):
-            await apply(ext, wanted(camera, NAME="Rear"))
-        assert (await apply(ext, wanted(camera, NAME="Rear"), allow_armed=True)).complete
+            await apply(ext, {"NAME": "Rear"})
+        assert (await apply(ext, {"NAME": "Rear"}, allow_armed=True)).complete

@@ -10,7 +10,7 @@ import pytest
 from paramclient.errors import UsageError
 from paramclient.metadata import ParamInfo
 from paramclient.model.identity import Identity
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, from_bits
 from paramclient.provision import CATEGORIES, MISSING, WRONG, ApplyStatus, Plan, plan_from
 from paramclient.provision.apply_rules import OUT_OF_RANGE, READ_ONLY
@@ -31,7 +31,7 @@ def held(**values: Value | tuple[ParamType | int, Value]) -> dict[str, Param]:
 
 
 def written(**values: Value) -> ParamSet:
-    return ParamSet({name: WrittenParam(name, value) for name, value in values.items()}, source="a file")
+    return ParamSet(values, source="a file")
 
 
 def copy_of(table: tuple[SimParam, ...]) -> dict[str, Param]:
@@ -56,91 +56,65 @@ def test_every_wanted_parameter_gets_a_status() -> None:
         written(ROLL_P=4, PITCH_P=6.5, STAT_RUNTIME=6, COUNT=300, PICTH_P=1),
         autopilot="ardupilot",
     )
-    assert {name: row.status for name, row in made.rows.items()} == {
-        "ROLL_P": ApplyStatus.UNCHANGED,
-        "PITCH_P": ApplyStatus.SET,
-        "STAT_RUNTIME": ApplyStatus.SKIPPED,
-        "COUNT": ApplyStatus.INVALID,
-        "PICTH_P": ApplyStatus.SKIPPED,
-    }
+    assert [str(row) for row in made.rows.values()] == [
+        "ROLL_P = 4, unchanged",
+        "PITCH_P 4.0 -> 6.5, set",
+        "STAT_RUNTIME 5 -> 6, skipped: left out: it is counted by the vehicle itself",
+        "COUNT = 300, invalid: 300 does not fit INT8, which holds -128 to 127",
+        "PICTH_P = 1, skipped: not on this vehicle",
+    ]
     (row,) = made.to_write
     assert (row.name, row.wanted.settable, row.type, row.before) == ("PITCH_P", 6.5, ParamType.REAL32, 4.0)
-    assert made.extra == ("OTHER",)
-    assert not made.complete
+    assert (made.extra, made.complete, set(made.problems)) == (("OTHER",), False, {"COUNT", "PICTH_P"})
     assert repr(made) == "<Plan 1 set, 1 invalid, 1 unchanged, 2 skipped in 1 stages>"
-    assert str(row) == "PITCH_P 4.0 -> 6.5, set"
-    assert str(made.rows["PICTH_P"]) == "PICTH_P = 1, skipped: not on this vehicle"
-    assert str(made.rows["ROLL_P"]) == "ROLL_P = 4, unchanged"
-    assert made.problems == {
-        "COUNT": "300 does not fit INT8, which holds -128 to 127",
-        "PICTH_P": "not on this vehicle",
-    }
 
 
 def test_a_mistyped_name_gets_the_nearest_names() -> None:
-    table = copy_of(ardupilot_table())
-    made = plan_from(
-        table, written(ATC_RAT_RRL_P=0.1, wpnav_speed=500, NO_SUCH_THING=1), autopilot="ardupilot"
-    )
-    assert made.rows["ATC_RAT_RRL_P"].nearest[0] == "ATC_RAT_RLL_P"
-    assert made.rows["wpnav_speed"].nearest[0] == "WPNAV_SPEED"
-    assert made.rows["NO_SUCH_THING"].nearest == ()
-    assert "did you mean ATC_RAT_RLL_P" in str(made.rows["ATC_RAT_RRL_P"])
+    wanted = written(ATC_RAT_RRL_P=0.1, wpnav_speed=500, NO_SUCH_THING=1)
+    made = plan_from(copy_of(ardupilot_table()), wanted, autopilot="ardupilot")
+    assert {name: row.nearest[:1] for name, row in made.rows.items()} == {
+        "ATC_RAT_RRL_P": ("ATC_RAT_RLL_P",),
+        "wpnav_speed": ("WPNAV_SPEED",),
+        "NO_SUCH_THING": (),
+    }
+
+
+LEFT_OUT = {
+    "ardupilot": {
+        "identity": ["SYSID_THISMAV", "MAV_SYSID", "ADSB_ICAO_ID", "NET_MACADDR0"],
+        "hardware": ["COMPASS_DEV_ID2", "COMPASS_PRIO1_ID", "INS_ACC2_ID", "INS_GYR_ID", "INS5_GYR_ID"],
+        "read-only": ["BARO1_DEVID", "BARO2_GND_PRESS"],
+        "calibration": [
+            *("COMPASS_OFS2_X", "INS_ACC2OFFS_Y", "AHRS_TRIM_X", "INS4_ACCOFFS_X", "INS_TCAL1_TMAX"),
+            "COMPASS_MOTCT",  # says by what the vehicle's COMPASS_MOT_? are multiplied
+        ],
+        "measured": ["INS_GYROFFS_Z", "INS4_GYR2_CALTEMP", "ARSPD_OFFSET", "COMPASS_DEC"],
+        "counter": ["STAT_RESET", "MIS_TOTAL"],
+    },
+    "px4": {
+        "identity": ["UXRCE_DDS_KEY", "MAV_SYS_ID"],
+        "hardware": ["CAL_MAG0_ID"],
+        "calibration": ["ASPD_SCALE_1", "CAL_MAG0_XOFF", "SENS_BOARD_X_OFF"],
+        "measured": ["CAL_BARO0_OFF"],
+        "counter": ["LND_FLIGHT_T_LO", "_HASH_CHECK"],
+    },
+}
 
 
 @pytest.mark.parametrize(
-    ("autopilot", "name", "category"),
-    [
-        ("ardupilot", "SYSID_THISMAV", "identity"),
-        ("ardupilot", "MAV_SYSID", "identity"),
-        ("ardupilot", "COMPASS_DEV_ID2", "hardware"),
-        ("ardupilot", "COMPASS_PRIO1_ID", "hardware"),
-        ("ardupilot", "BARO1_DEVID", "read-only"),
-        ("ardupilot", "INS_ACC2_ID", "hardware"),
-        ("ardupilot", "INS_GYR_ID", "hardware"),
-        ("ardupilot", "COMPASS_OFS2_X", "calibration"),
-        ("ardupilot", "INS_ACC2OFFS_Y", "calibration"),
-        ("ardupilot", "INS_GYROFFS_Z", "measured"),
-        ("ardupilot", "INS4_GYR2_CALTEMP", "measured"),
-        ("ardupilot", "BARO2_GND_PRESS", "read-only"),
-        ("ardupilot", "ARSPD_OFFSET", "measured"),
-        ("ardupilot", "COMPASS_DEC", "measured"),
-        ("ardupilot", "AHRS_TRIM_X", "calibration"),
-        (
-            "ardupilot",
-            "COMPASS_MOTCT",
-            "calibration",
-        ),  # says by what the vehicle's COMPASS_MOT_? are multiplied
-        ("ardupilot", "INS4_ACCOFFS_X", "calibration"),
-        ("ardupilot", "INS_TCAL1_TMAX", "calibration"),
-        ("ardupilot", "INS5_GYR_ID", "hardware"),
-        ("ardupilot", "ADSB_ICAO_ID", "identity"),
-        ("ardupilot", "NET_MACADDR0", "identity"),
-        ("ardupilot", "STAT_RESET", "counter"),
-        ("ardupilot", "MIS_TOTAL", "counter"),
-        ("px4", "UXRCE_DDS_KEY", "identity"),
-        ("px4", "ASPD_SCALE_1", "calibration"),
-        ("px4", "MAV_SYS_ID", "identity"),
-        ("px4", "CAL_MAG0_ID", "hardware"),
-        ("px4", "CAL_MAG0_XOFF", "calibration"),
-        ("px4", "CAL_BARO0_OFF", "measured"),
-        ("px4", "SENS_BOARD_X_OFF", "calibration"),
-        ("px4", "LND_FLIGHT_T_LO", "counter"),
-        ("px4", "_HASH_CHECK", "counter"),
-    ],
+    ("autopilot", "category"), [(each, category) for each, found in LEFT_OUT.items() for category in found]
 )
-def test_parameters_that_are_no_settings_are_left_out_unless_included(
-    autopilot: str, name: str, category: str
-) -> None:
-    table, wanted = held(**{name: 1}), written(**{name: 2})
-    left_out = plan_from(table, wanted, autopilot=autopilot)
-    status, kind, reason = only_row(left_out)
-    assert (status, kind) == (ApplyStatus.SKIPPED, category)
-    assert reason.startswith("left out: it ")
-    assert left_out.rows[name].differs
-    assert not left_out.stages
-    for include in (category, name, name[:5] + "*", (category,)):
-        assert order(plan_from(table, wanted, autopilot=autopilot, include=include)) == [[name]]
+def test_parameters_that_are_no_settings_are_left_out_unless_included(autopilot: str, category: str) -> None:
+    for name in LEFT_OUT[autopilot][category]:
+        table, wanted = held(**{name: 1}), written(**{name: 2})
+        left_out = plan_from(table, wanted, autopilot=autopilot)
+        status, kind, reason = only_row(left_out)
+        assert (status, kind) == (ApplyStatus.SKIPPED, category)
+        assert reason.startswith("left out: it ")
+        assert left_out.rows[name].differs
+        assert not left_out.stages
+        for include in (category, name, name[:5] + "*", (category,)):
+            assert order(plan_from(table, wanted, autopilot=autopilot, include=include)) == [[name]]
 
 
 @pytest.mark.parametrize(
@@ -218,14 +192,13 @@ def test_a_value_that_the_parameter_cannot_take_is_invalid(
 def test_a_value_outside_of_the_metadata_range_is_invalid() -> None:
     table = held(P=1.0, Q=7.0)
     info = {"P": Info(minimum=0.1, maximum=2.0), "Q": Info(maximum=2.0)}
-    for value, says in ((0.05, "0.05 is below the minimum of 0.1"), (2.5, "2.5 is above the maximum of 2.0")):
+    for value, says in ((0.05, "0.05 is below the minimum of 0.1"), (2.5, "2.5 is above the maximum of 2")):
         status, category, reason = only_row(plan_from(table, written(P=value), info=info))
-        assert (status, category, reason) == (ApplyStatus.INVALID, OUT_OF_RANGE, says)
+        assert (status, category, says in reason) == (ApplyStatus.INVALID, OUT_OF_RANGE, True)
         assert plan_from(table, written(P=value), info=info, include=OUT_OF_RANGE).to_write
         assert plan_from(table, written(P=value)).to_write
     for value in (0.1, 2, 0.10000000149011612):
         assert plan_from(table, written(P=value), info=info).to_write
-    assert plan_from(table, written(P=3.0), info={"P": Info(minimum=-1e300, maximum=1e300)}).to_write
     # what the vehicle has already is no mistake of the file
     assert only_row(plan_from(table, written(Q=7), info=info))[0] is ApplyStatus.UNCHANGED
 
@@ -261,25 +234,18 @@ def test_metadata_marks_read_only_and_reboot_parameters() -> None:
 
 
 def test_values_are_compared_in_the_type_of_the_vehicle() -> None:
-    table = held(A=0.1, B=(ParamType.UINT8, 3), C=-0.0, D=16777217)
-    assert plan_from(table, written(A=0.1, B=3.0, C=0, D=16777217), autopilot="px4").complete
-    assert order(plan_from(table, written(A=0.1, D=16777216), autopilot="px4")) == [["D"]]
-
-
-def test_raw_bytes_are_compared_with_raw_bytes() -> None:
-    table = held(ODD=(77, RAW))
-    assert plan_from(table, written(ODD=RAW)).complete
-    assert plan_from(table, written(ODD=RAW[::-1])).rows["ODD"].status is ApplyStatus.SET
+    table = held(A=0.1, B=(ParamType.UINT8, 3), C=-0.0, D=16777217, ODD=(77, RAW))
+    assert plan_from(table, written(A=0.1, B=3.0, C=0, D=16777217, ODD=RAW), autopilot="px4").complete
+    made = plan_from(table, written(A=0.1, D=16777216, ODD=RAW[::-1]), autopilot="px4")
+    assert order(made) == [["D", "ODD"]]
     assert plan_from(table, written(ODD=5)).rows["ODD"].status is ApplyStatus.INVALID
 
 
 def test_the_order_of_stages_works_on_ardupilot() -> None:
     table = held(WPNAV_SPEED=500.0, EK2_ENABLE=0, FRAME_CLASS=1, GPS1_TYPE=1, FENCE_ENABLE=1)
-    wanted = written(
-        FENCE_ENABLE=0, WPNAV_SPEED=600, SYSID_ENFORCE=1, GPS1_TYPE=2, EK2_ENABLE=1, FRAME_CLASS=2
-    )
     ids = held(SYSID_ENFORCE=0, SYSID_THISMAV=1)
-    wanted = written(SYSID_THISMAV=7, **{name: param.value for name, param in wanted.items()})
+    first = written(SYSID_THISMAV=7, FENCE_ENABLE=0, WPNAV_SPEED=600, SYSID_ENFORCE=1)
+    wanted = ParamSet({**first, **written(GPS1_TYPE=2, EK2_ENABLE=1, FRAME_CLASS=2)})
     made = plan_from(table | ids, wanted, autopilot="ardupilot", include="identity")
     assert order(made) == [
         ["FRAME_CLASS"],
@@ -336,21 +302,15 @@ def test_a_plan_for_the_saved_table_of_a_vehicle_has_no_steps() -> None:
 
 
 def test_a_file_of_another_component_is_refused() -> None:
-    camera = ParamSet({"A": WrittenParam("A", 1)}, component=100, source="cam.params")
-    autopilot = ParamSet(held(A=2), component=1)
-    with pytest.raises(
-        UsageError, match=r"parameters of cam.params are those of component 100, not of component 1"
-    ):
-        plan_from(autopilot, camera)
+    camera = ParamSet({"A": 1}, component=100, source="cam.params")
+    with pytest.raises(UsageError, match=r"of cam.params are those of component 100, not of component 1"):
+        plan_from(ParamSet(held(A=2), component=1), camera)
 
 
 def test_a_file_of_another_autopilot_is_refused() -> None:
     for own, other, number in (("px4", "ardupilot", 3), ("ardupilot", "px4", 12)):
-        wanted = ParamSet(
-            {"A": WrittenParam("A", 2)}, identity=Identity(1, "sim:", autopilot=number), source="f"
-        )
+        wanted = ParamSet({"A": 2}, identity=Identity(1, "sim:", autopilot=number), source="f")
         with pytest.raises(UsageError, match=f"of f are those of a vehicle with {other}, not with {own}"):
             plan_from(held(A=1), wanted, autopilot=own)
-        assert plan_from(held(A=1), wanted, autopilot=other).to_write
-        assert plan_from(held(A=1), wanted, autopilot="generic").to_write
-        assert plan_from(held(A=1), wanted).to_write
+        for fitting in (other, "generic", None):
+            assert plan_from(held(A=1), wanted, autopilot=fitting).to_write

@@ -13,7 +13,7 @@ from paramclient.model.notation import time_text
 from paramclient.provision import resolve
 from paramclient.provision.sources import read_source
 from paramclient.sim import PX4Vehicle
-from tests.shell import a_client, in_simulated_time
+from tests.shell import a_client
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -23,7 +23,6 @@ def placed(path: Path, text: str) -> Path:
     return path
 
 
-@in_simulated_time
 async def test_every_source_becomes_a_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"A 1\n")))
     monkeypatch.chdir(tmp_path)
@@ -47,7 +46,6 @@ async def test_every_source_becomes_a_set(tmp_path: Path, monkeypatch: pytest.Mo
     assert time_text(log.at).startswith("2026-11-20")
 
 
-@in_simulated_time
 async def test_a_set_that_a_text_does_not_give_is_an_error(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -70,5 +68,3 @@ async def test_a_set_that_a_text_does_not_give_is_an_error(
         await resolve(str(file))
     with pytest.raises(UsageError, match="excludes"):
         await resolve("1", cache=False)
-    with pytest.raises(UsageError, match="the kind of link is missing"):
-        await resolve("quad", cache=False)
