@@ -94,9 +94,7 @@ async def test_values_written_late_keep_their_times_and_the_whole_history(
     assert warning.startswith("continuing without the cache: ")
 
 
-async def test_a_cause_has_one_warning_from_open_to_close(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_one_cause_has_one_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Also where nothing is to be written for a time: that is no success."""
     vehicle = small_px4()
     async with connected(vehicle, cache=f"postgresql://me@/fleet?host={tmp_path}") as (client, component):
@@ -112,7 +110,7 @@ async def test_a_cause_has_one_warning_from_open_to_close(
     assert "\n" not in warning
 
 
-async def test_after_very_many_changes_the_whole_table_is_written(
+async def test_after_many_changes_the_whole_table_is_written(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cache_writer, "PENDING_MAX", 20)
@@ -130,7 +128,7 @@ async def test_after_very_many_changes_the_whole_table_is_written(
 
 
 @UNWRITABLE
-async def test_a_client_that_ends_says_what_is_lost(
+async def test_an_end_says_what_is_lost(
     unwritable: Holding, path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with ExitStack() as held:

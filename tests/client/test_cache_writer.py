@@ -207,9 +207,7 @@ PARAMETER_REQUESTS = (messages.ParamRequestRead, messages.ParamRequestList)
 
 
 @pytest.mark.parametrize("unanswered", [PARAMETER_REQUESTS, (*PARAMETER_REQUESTS, messages.CommandLong)])
-async def test_a_silent_component_with_a_cached_table_delays_no_other_component(
-    path: Path, unanswered: Any
-) -> None:
+async def test_a_silent_component_with_a_cached_table_delays_no_other(path: Path, unanswered: Any) -> None:
     vehicle, silent = small_px4(), Reticent(system=2, table=VALUES)
     async with ParamClient(Air([vehicle, silent]), cache=path) as client:
         assert not (await client.fetch_all()).silent
@@ -516,9 +514,7 @@ async def test_names_that_change_by_themselves_are_learnt_for_later_sessions(pat
 
 
 @pytest.mark.parametrize("kind", ["no file", "silent"])
-async def test_a_vehicle_without_the_parameter_file_is_remembered_for_its_firmware(
-    path: Path, kind: str
-) -> None:
+async def test_vehicle_without_parameter_file_is_remembered_for_its_firmware(path: Path, kind: str) -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     server = vehicle.file_server
     assert server is not None

@@ -466,9 +466,7 @@ async def test_calls_go_on_when_the_link_is_back() -> None:
         assert not residue(component)
 
 
-async def test_a_link_that_stays_disconnected_fails_the_calls_and_not_the_client(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+async def test_a_link_that_stays_disconnected_fails_only_calls(caplog: pytest.LogCaptureFixture) -> None:
     tap = Tap(generic())
     link = FlakyLink(tap)
     async with connected(link) as (client, component):

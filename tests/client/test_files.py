@@ -85,7 +85,7 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
         pytest.param(SimLink, 0.1, 0.1, id="fails"),
     ],
 )
-async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(
+async def test_a_scope_ends_a_client_on_any_link(
     make: Any, closes_after: float | None, longest: float
 ) -> None:
     vehicle = with_files()

@@ -175,7 +175,7 @@ def test_the_command_writes_logs_too(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize("now", [-86400.0, 30.0])
-async def test_a_clock_that_was_never_set_ends_nothing(
+async def test_a_clock_that_was_never_set(
     now: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("paramclient.client.taps.time.time", lambda: now)
@@ -217,9 +217,7 @@ async def test_a_log_that_exists_is_not_written_over(tmp_path: Path) -> None:
             raise AssertionError("it was opened")
 
 
-async def test_a_full_disk_ends_the_log_and_nothing_else(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_full_disk_ends_log_and_nothing_else(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "flight.tlog"
     with full_disk(300):
         async with connected(small_px4(), tlog=path) as (_, component):
@@ -232,7 +230,7 @@ async def test_a_full_disk_ends_the_log_and_nothing_else(
     assert recorded(path)  # whole frames, and nothing behind them
 
 
-async def test_a_disk_that_falls_behind_ends_the_log(
+async def test_a_slow_disk_ends_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(taps, "UNWRITTEN_BYTES_MAX", 1000)

@@ -107,7 +107,7 @@ def test_invalid_signing_settings_are_refused_at_once() -> None:
 # Timestamps
 
 
-async def test_a_client_whose_clock_was_set_back_adopts_the_timestamp_of_the_vehicle(
+async def test_a_clock_that_was_set_back_adopts_the_vehicles_timestamp(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     vehicle = signed_vehicle(signing_timestamp=NOW)
@@ -187,7 +187,7 @@ async def test_a_vehicle_of_mavlink_1_is_given_no_key_and_is_answered_unsigned()
 # What never shows
 
 
-def test_the_key_shows_nowhere(
+def test_no_key_shows(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A life with everything in it; then all that was written is looked through."""

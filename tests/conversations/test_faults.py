@@ -157,7 +157,7 @@ any_message = st.one_of(
 @settings(max_examples=25, deadline=None)
 @given(st.lists(any_message, max_size=60), st.lists(st.binary(max_size=60), max_size=5))
 @virtual
-async def test_no_message_and_no_bytes_raise_whatever_is_in_progress(
+async def test_no_messages_and_no_bytes_raise_in_any_call(
     messages: list[Message], noise: list[bytes]
 ) -> None:
     async with converse(PX4Vehicle(table={"A": 1, "B": 2.5})) as conversation:

@@ -161,7 +161,7 @@ async def test_a_vehicle_that_is_lost_after_its_hash_is_told_as_lost() -> None:
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
 @pytest.mark.parametrize("fetched_after", [None, 0.0, 0.02, 0.1])
 @virtual_on_both
-async def test_a_vehicle_that_takes_the_address_of_another_is_fetched_whole(
+async def test_another_vehicle_at_the_address_is_fetched_whole(
     kind: str, fetched_after: float | None
 ) -> None:
     """During the fetch, or some seconds before it."""
@@ -187,9 +187,7 @@ async def test_a_vehicle_that_takes_the_address_of_another_is_fetched_whole(
 
 
 @pytest.mark.parametrize(("known_at", "source"), [(1.0, "ftp"), (2.5, "stream")])
-async def test_a_first_fetch_waits_for_the_identity_of_the_vehicle_but_not_for_long(
-    known_at: float, source: str
-) -> None:
+async def test_a_first_fetch_waits_for_the_identity_but_not_for_long(known_at: float, source: str) -> None:
     """A value is received first: only the heartbeat says that there is a file."""
     vehicle = ArduPilotVehicle()
 

@@ -103,9 +103,7 @@ def test_a_path_that_no_message_holds_is_refused(path: str) -> None:
 
 
 @pytest.mark.parametrize("code", [FileErrorCode.UNKNOWN_COMMAND, FileErrorCode.FAIL])
-async def test_a_refused_read_ends_the_transfer_and_a_server_without_bursts_serves_reads(
-    code: FileErrorCode,
-) -> None:
+async def test_refused_read_ends_transfer_and_server_without_bursts_serves_reads(code: FileErrorCode) -> None:
     vehicle = serving(2_000)
 
     def up(message: Message) -> bool:

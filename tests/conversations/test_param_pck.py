@@ -134,7 +134,7 @@ tables = st.lists(entries(), max_size=40, unique_by=lambda each: each.name)
 
 @busy
 @given(tables, st.integers(1, 239), st.booleans(), st.integers(0, 5))
-def test_an_encoded_file_decodes_to_the_same_entries(
+def test_encoding_and_decoding(
     rows: list[PackedParam], read_size: int, with_defaults: bool, more: int
 ) -> None:
     data = encode(rows, total=len(rows) + more, with_defaults=with_defaults, read_size=read_size)

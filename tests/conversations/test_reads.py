@@ -45,7 +45,7 @@ async def test_reads_by_name_and_index_bring_the_vehicles_values(make: type[Vehi
 
 @EVERY
 @pytest.mark.parametrize("which", ["MC_ROLLP", 5000])
-async def test_a_vehicle_that_answers_other_reads_has_no_such_parameter(
+async def test_silence_to_one_read_of_many_is_no_such_parameter(
     make: type[Vehicle], which: str | int
 ) -> None:
     vehicle = make()
@@ -173,9 +173,7 @@ async def test_reads_wait_while_the_link_is_down_and_end_when_it_fails() -> None
 
 @virtual_on_both
 @pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
-async def test_equal_reads_at_once_are_one_request_and_a_cancelled_one_ends_only_its_wait(
-    make: type[PX4Vehicle],
-) -> None:
+async def test_equal_reads_are_one_request_and_a_cancelled_one_ends_alone(make: type[PX4Vehicle]) -> None:
     vehicle = make()
     name = vehicle.listed[5].name
     async with talking(Air.symmetric([vehicle], delay=0.05)) as (_, session):

@@ -301,7 +301,7 @@ async def test_a_vehicle_with_a_new_system_id_is_another_component_with_the_same
 @virtual_on_both
 @MAKES
 @pytest.mark.parametrize("loss", [0.0, 0.2])
-async def test_a_reboot_on_command_happens_once_and_returns_when_the_vehicle_is_back(
+async def test_a_reboot_happens_once_and_returns_when_the_vehicle_is_back(
     make: type[Vehicle], loss: float
 ) -> None:
     vehicle = make()

@@ -48,7 +48,7 @@ PARTS = [
 
 @pytest.mark.parametrize("parts", PARTS, ids="+".join)
 @pytest.mark.parametrize(("delay", "loss"), [(0.0, 0.0), (0.05, 0.1), (0.3, 0.0)])
-async def test_what_a_vehicle_serves_is_enough_to_read_and_to_prove_a_set(
+async def test_any_part_suffices_to_read_and_to_prove_a_set(
     parts: tuple[str, ...], delay: float, loss: float
 ) -> None:
     vehicle = Partial(serves=parts)
@@ -131,7 +131,7 @@ async def test_odd_indices_and_counts_make_a_complete_table(
 
 @pytest.mark.parametrize("serves", [EVERYTHING, ("list",)], ids=["reads", "list only"])
 @pytest.mark.parametrize("loss", [0.1, 0.2])
-async def test_a_list_whose_count_grows_is_never_complete_without_its_end(
+async def test_a_growing_count_is_never_complete_without_its_end(
     loss: float, serves: tuple[str, ...]
 ) -> None:
     table = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
@@ -144,7 +144,7 @@ async def test_a_list_whose_count_grows_is_never_complete_without_its_end(
 
 @pytest.mark.parametrize("interval", [0.3, 0.7, 1.0])
 @pytest.mark.parametrize("heartbeat", [QUIET, PX4], ids=["generic", "PX4"])
-async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
+async def test_a_slow_list_with_a_growing_count_is_received(
     interval: float, heartbeat: messages.Heartbeat
 ) -> None:
     async with talking(Puppet(lambda message: (), heartbeat=heartbeat)) as (conversation, session):
@@ -169,7 +169,7 @@ async def test_a_slow_list_whose_count_grows_is_received_to_its_end(
     "serves", [("indices", "sets", "acks", "commands"), ("indices", "sets")], ids="+".join
 )
 @virtual_on_both
-async def test_a_vehicle_without_list_is_read_by_its_indices(
+async def test_without_a_list_indices_are_read(
     heartbeat: messages.Heartbeat, serves: tuple[str, ...]
 ) -> None:
     table = {f"P{number:02}": (number / 2, ParamType.REAL32) for number in range(60)}
@@ -222,7 +222,7 @@ async def test_a_name_that_no_file_can_hold_is_noted_and_not_missed(name: str) -
 
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("too_many", [0, 2])
-async def test_a_name_that_is_not_in_the_list_of_an_ardupilot_without_reads_is_unknown(
+async def test_a_name_that_an_ardupilot_without_reads_does_not_list_is_unknown(
     first: int, too_many: int
 ) -> None:
     table = {"abc_def": (5.0, ParamType.REAL32), "ghi": (1.0, ParamType.REAL32)}
@@ -250,7 +250,7 @@ async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(serve
 @pytest.mark.parametrize("heartbeat", [ARDUPILOT, QUIET, PX4], ids=["AP", "generic", "PX4"])
 @pytest.mark.parametrize("parts", [("list", "sets"), ("list", "sets", "acks")], ids="+".join)
 @virtual_on_both
-async def test_a_value_of_a_list_is_taken_without_its_end(
+async def test_a_listed_value_is_taken_before_the_end(
     heartbeat: messages.Heartbeat, parts: tuple[str, ...]
 ) -> None:
     count = len(TABLE) + 3_000
@@ -330,7 +330,7 @@ async def test_the_encoding_is_looked_for_once_and_within_a_round_trip(maker: ty
 
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("serves", [EVERYTHING, ("list",), ("names", "indices"), ("indices",)], ids="+".join)
-async def test_a_component_without_heartbeat_is_asked_where_it_is_named_in_full(
+async def test_a_component_without_heartbeat_is_found_by_both_ids(
     serves: tuple[str, ...], first: int
 ) -> None:
     bridge = Partial(serves=serves, first=first, heartbeat=None, component=240)
@@ -385,9 +385,7 @@ async def test_a_vehicle_with_system_id_0_is_named_as_that() -> None:
     ],
     ids=["companion", "camera", "gimbal", "gimbal by its id", "radio"],
 )
-async def test_a_part_of_a_vehicle_is_never_the_vehicle(
-    heartbeat: messages.Heartbeat, component: int
-) -> None:
+async def test_part_of_a_vehicle_is_never_the_vehicle(heartbeat: messages.Heartbeat, component: int) -> None:
     part = Partial(heartbeat=heartbeat, system=2, component=component)
     async with ParamClient(part, cache=False) as client:
         for choose in (client.component, client.only_component):

@@ -70,7 +70,7 @@ async def test_values_of_every_type_are_set(loss: float) -> None:
 
 
 @pytest.mark.parametrize(("make", "name"), [(PX4Vehicle, "MC_ROLL_P"), (ArduPilotVehicle, "ATC_ANG_RLL_P")])
-async def test_a_value_is_the_shortest_decimal_of_its_float(
+async def test_a_value_is_its_shortest_decimal(
     make: type[PX4Vehicle] | type[ArduPilotVehicle], name: str
 ) -> None:
     async with talking(make()) as (_, session):
@@ -195,7 +195,7 @@ async def test_a_type_that_has_changed_is_taken_or_is_a_mismatch(value: int, fit
     ],
 )
 @pytest.mark.parametrize("order", ["E", "VE", "EV"])
-async def test_a_refusal_counts_whether_the_old_value_comes_with_it(
+async def test_a_refusal_counts_beside_old_values(
     code: int, kind: type[errors.ParamClientError], order: str
 ) -> None:
     answers: dict[str, Message] = {
@@ -367,7 +367,7 @@ async def test_values_are_accepted_though_they_could_not_be_watched(timeout: flo
         ("an interrupted link", "never"),
     ],
 )
-async def test_no_set_is_sent_to_another_vehicle_and_a_rebooted_one_gets_the_others(
+async def test_another_vehicle_gets_no_set_and_a_rebooted_one_the_others(
     doubt: str, is_same: bool, said: str
 ) -> None:
     first, other = PX4Vehicle(uid=1), PX4Vehicle(uid=2)

@@ -90,8 +90,6 @@ async def test_odd_addresses_and_queries_are_problems() -> None:
 
 
 @pytest.mark.parametrize(("method", "what", "body"), REFUSED)
-async def test_a_body_that_means_nothing_is_refused_with_its_faults(
-    method: str, what: str, body: dict[str, Any]
-) -> None:
+async def test_a_senseless_body_is_refused(method: str, what: str, body: dict[str, Any]) -> None:
     async with browsing(generic()) as browser:
         problem(await browser.request(method, f"{V}/{what}", json=body), 422, "invalid-request")

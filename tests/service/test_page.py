@@ -246,9 +246,7 @@ def test_a_table_is_fetched_and_saved(bench: Bench, visit: Callable[..., Sight],
     assert "MC_ROLL_P" in read_file(file).sets[0]
 
 
-def test_ground_stations_are_shown_with_what_the_cache_saved(
-    bench: Bench, visit: Callable[..., Sight]
-) -> None:
+def test_ground_stations_are_shown_with_what_cache_saved(bench: Bench, visit: Callable[..., Sight]) -> None:
     station = mavutil.mavlink_connection(bench.endpoint.replace("tcpin", "tcp"), source_system=254)
     station.wait_heartbeat(timeout=20)
     station.param_fetch_all()
@@ -262,9 +260,7 @@ def test_ground_stations_are_shown_with_what_the_cache_saved(
     station.close()
 
 
-def test_extended_parameters_are_staged_and_undone_like_others(
-    bench: Bench, visit: Callable[..., Sight]
-) -> None:
+def test_extended_parameters_are_staged_and_undone(bench: Bench, visit: Callable[..., Sight]) -> None:
     sight = visit(bench.url)
     camera = "Camera 4/100, extended"
     sight.page.get_by_role("navigation").get_by_role("button", name=camera).click()
@@ -312,9 +308,7 @@ def test_on_a_phone_values_are_edited_in_the_sheet(bench: Bench, visit: Callable
     assert width <= PHONE["viewport"]["width"]
 
 
-def test_before_a_token_the_page_only_asks_to_sign_in(
-    browser: Browser, visit: Callable[..., Sight], tmp_path: Path
-) -> None:
+def test_without_a_token_one_signs_in(browser: Browser, visit: Callable[..., Sight], tmp_path: Path) -> None:
     file = tmp_path / "tokens"
     reads, writes = add_token(file, "eye", "read"), add_token(file, "hand", "write")
     with at_work(tmp_path, tokens=read_tokens(file)) as bench:

@@ -50,9 +50,7 @@ async def served(*words: str) -> AsyncIterator[tuple[asyncio.subprocess.Process,
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.asyncio
-async def test_a_signal_ends_it_cleanly_with_streams_and_requests_open(
-    tmp_path: Path, number: signal.Signals
-) -> None:
+async def test_a_signal_ends_it_with_streams_and_requests(tmp_path: Path, number: signal.Signals) -> None:
     words = ("sim:px4", "--cache", str(tmp_path / "cache.sqlite3"))
     async with served(*words) as (process, browser), anyio.create_task_group() as tasks:
         await synced(browser)
@@ -102,9 +100,7 @@ async def test_it_wants_a_token_of_its_file(tmp_path: Path) -> None:
         ([], "link"),
     ],
 )
-def test_what_cannot_be_served_is_refused_at_the_start(
-    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_arguments_are_refused(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     options = [] if {"--cache", "--no-cache"} & set(words) else ["--no-cache"]
     ended = in_process(capsys)("serve", *words, *options)
     assert (ended.code, ended.out) == (2, "")

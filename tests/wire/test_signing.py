@@ -147,7 +147,7 @@ def test_keys_are_equal_by_their_bytes_and_distinguished_by_their_fingerprints()
     component=st.integers(1, 255),
     payload=st.binary(min_size=2, max_size=2),
 )
-def test_our_signatures_are_pymavlinks(
+def test_our_signatures(
     timestamp: int, link_id: int, sequence: int, system: int, component: int, payload: bytes
 ) -> None:
     message = ParamRequestList(*payload)
@@ -160,9 +160,7 @@ def test_our_signatures_are_pymavlinks(
 
 
 @given(timestamp=timestamps, link_id=byte, more=st.lists(st.integers(0, 10_000_000), max_size=5))
-def test_pymavlink_takes_what_we_sign_and_we_what_it_signs(
-    timestamp: int, link_id: int, more: list[int]
-) -> None:
+def test_pymavlink_takes_what_we_sign_and_reversely(timestamp: int, link_id: int, more: list[int]) -> None:
     signer = Signer(KEY, link_id=link_id, timestamp=timestamp)
     theirs = pymavlink(timestamp=timestamp, link_id=link_id)
     verifier = Verifier(Signer(KEY, timestamp=timestamp), SigningPolicy.SIGNED_ONLY)
