@@ -17,7 +17,15 @@ from paramclient.protocol.set_results import SetStatus
 from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, Camera, Endpoint, PX4Vehicle
 from paramclient.wire import messages
-from tests.conversations.virtual import Conversation, Silence, Tap, converse, meanwhile, virtual_on_both
+from tests.conversations.virtual import (
+    Conversation,
+    Silence,
+    Tap,
+    converse,
+    losing,
+    meanwhile,
+    virtual_on_both,
+)
 
 CAMERA = (1, 100)
 
@@ -84,28 +92,20 @@ async def test_a_value_that_the_camera_changes_is_adjusted() -> None:
 
 @pytest.mark.parametrize("seconds", [0.5, 30.0])
 async def test_progress_extends_the_wait_and_a_lost_result_is_requested_again(seconds: float) -> None:
-    camera = Camera(slow={"CAM_MODE": seconds})
-    lost = [0]
+    def is_result(message: messages.Message) -> bool:
+        return isinstance(message, messages.ParamExtAck) and message.param_result == 0
 
-    def lose_result(message: messages.Message) -> bool:
-        if isinstance(message, messages.ParamExtAck) and message.param_result == 0 and not lost[0]:
-            lost[0] += 1
-            return False
-        return True
-
-    endpoint = Tap(camera)
+    endpoint = Tap(Camera(slow={"CAM_MODE": seconds}))
     async with filming(endpoint) as (_, session):
         result = await write(session, "CAM_MODE", 2)
         assert (result.actual, result.attempts) == (2, 1)
-        endpoint.down = lose_result
+        endpoint.down = losing(1, is_result)
         result = await write(session, "CAM_WBMODE", 2)
-        assert (result.actual, lost[0], result.attempts) == (2, 1, 2)
-        lost.clear()
-        lost.append(0)
-        began = anyio.current_time()
-        result = await write(session, "CAM_MODE", 1)
-        assert (result.actual, lost[0], result.attempts) == (1, 1, 1)  # a read has shown the value
-        assert anyio.current_time() - began <= seconds + 2.5
+        assert (result.actual, result.attempts) == (2, 2)
+        endpoint.down = losing(1, is_result)
+        with anyio.fail_after(seconds + 2.5):
+            result = await write(session, "CAM_MODE", 1)
+        assert (result.actual, result.attempts) == (1, 1)  # a read has shown the value
 
 
 @virtual_on_both

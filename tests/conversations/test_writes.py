@@ -6,6 +6,7 @@ import math
 import struct
 from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import replace
+from typing import Any
 
 import anyio
 import pytest
@@ -29,8 +30,9 @@ from paramclient.wire.messages import (
     encode,
 )
 from tests.conversations.partial import Partial
-from tests.conversations.virtual import Silence, Tap, converse, meanwhile, talking, virtual_on_both
+from tests.conversations.virtual import Silence, Tap, converse, losing, meanwhile, talking, virtual_on_both
 
+Maker = type[PX4Vehicle] | type[ArduPilotVehicle]
 EVERY_TYPE = {
     ParamType.UINT8: 255,
     ParamType.INT8: -128,
@@ -69,26 +71,25 @@ async def test_values_of_every_type_are_set(loss: float) -> None:
         assert loss or vehicle.requests["PARAM_REQUEST_READ"] == reads  # and is known from then on
 
 
-@pytest.mark.parametrize(("make", "name"), [(PX4Vehicle, "MC_ROLL_P"), (ArduPilotVehicle, "ATC_ANG_RLL_P")])
-async def test_a_value_is_its_shortest_decimal(
-    make: type[PX4Vehicle] | type[ArduPilotVehicle], name: str
+@pytest.mark.parametrize(
+    ("make", "name", "requested", "actual", "text"),
+    [
+        (PX4Vehicle, "MC_ROLL_P", 6.1, 6.1, "MC_ROLL_P = 6.1"),
+        (ArduPilotVehicle, "ATC_ANG_RLL_P", 6.1, 6.1, "ATC_ANG_RLL_P = 6.1"),
+        (ArduPilotVehicle, "RTL_ALT", 1234.7, 1234, "RTL_ALT = 1234 (adjusted from 1234.7)"),
+    ],
+)
+async def test_a_value_is_its_shortest_decimal_and_a_truncated_one_adjusted(
+    make: Maker, name: str, requested: float, actual: float, text: str
 ) -> None:
-    async with talking(make()) as (_, session):
-        result = await write(session, name, 6.1)
-        assert (result.status, result.actual, result.attempts) == ("accepted", 6.1, 1)
-        assert result.param.bits == int.from_bytes(struct.pack("<f", 6.1), "little")
-        assert str(result) == f"{name} = 6.1"
-
-
-async def test_ardupilot_truncates_a_fraction_which_is_an_adjustment() -> None:
-    async with talking(ArduPilotVehicle()) as (_, session):
+    async with talking(vehicle := make()) as (_, session):
         await fetch_all(session)
-        index = session.table.params["RTL_ALT"].index
-        result = await write(session, "RTL_ALT", 1234.7)
-        assert (result.status, result.requested, result.actual) == ("adjusted", 1234.7, 1234)
-        assert result.attempts == 1
-        assert str(result) == "RTL_ALT = 1234 (adjusted from 1234.7)"
-        assert session.table.params["RTL_ALT"].index == index  # its acknowledgement has 65535
+        before = session.table.params[name]
+        result = await write(session, name, requested)
+        assert (result.requested, result.actual, result.attempts) == (requested, actual, 1)
+        assert str(result) == text
+        assert result.param.same_value(vehicle.param(name))
+        assert session.table.params[name].index == before.index  # ArduPilot's acknowledgement has 65535
 
 
 async def test_ardupilots_acknowledgement_of_a_default_in_another_type_keeps_the_type() -> None:
@@ -105,27 +106,6 @@ async def test_ardupilots_acknowledgement_of_a_default_in_another_type_keeps_the
             result = await write(session, param.name, param.value)
             assert (result.status, result.param.type) == ("accepted", ParamType.INT8)
             assert result.attempts == 1
-
-
-async def test_an_integer_that_float32_cannot_hold_is_not_sent_to_ardupilot() -> None:
-    vehicle = ArduPilotVehicle()
-    name = next(param.name for param in vehicle.listed if param.type is ParamType.INT32)
-    async with talking(vehicle) as (conversation, session):
-        with pytest.raises(errors.UsageError, match="cannot be sent exactly"):
-            await write(session, name, 2**24 + 1)
-        assert not conversation.sent_of(ParamSet)
-
-
-@pytest.mark.parametrize(("name", "value"), [("MC_ROLL_P", math.nan), ("COM_RC_LOSS_T", math.inf)])
-async def test_nan_and_infinity_are_sent_to_px4_only_if_forced(name: str, value: float) -> None:
-    vehicle = PX4Vehicle()
-    async with talking(vehicle) as (conversation, session):
-        with pytest.raises(errors.UsageError, match="was not sent to 1/1"):
-            await write(session, name, value)
-        assert not conversation.sent_of(ParamSet)
-        result = await write(session, name, value, force=True)
-        assert isinstance(result.actual, float)
-        assert not math.isfinite(result.actual)
 
 
 async def test_px4_clamps_a_value_later_which_a_watched_write_reports() -> None:
@@ -152,17 +132,26 @@ async def test_a_read_only_parameter_is_refused_with_its_reason(param_error: boo
         assert len(conversation.sent_of(ParamSet)) == 1
 
 
-async def test_an_unknown_name_and_values_that_do_not_fit_are_not_set() -> None:
-    for vehicle in (PX4Vehicle(), ArduPilotVehicle(param_error=True)):
-        async with talking(vehicle) as (conversation, session):
-            with pytest.raises(errors.UnknownParameter):
-                await write(session, "NO_SUCH", 1)
-            name = next(param.name for param in vehicle.listed if param.type is ParamType.INT32)
-            for value in (2**31, "text"):
-                with pytest.raises(errors.UsageError):
-                    await write(session, name, value)
-            assert not conversation.sent_of(ParamSet)
-            assert not session.writing
+@pytest.mark.parametrize(
+    ("make", "value"),
+    [
+        *((make, value) for make in (PX4Vehicle, ArduPilotVehicle) for value in (2**31, "text")),
+        *((PX4Vehicle, math.nan), (PX4Vehicle, math.inf), (ArduPilotVehicle, 2**24 + 1)),
+    ],
+)
+async def test_a_value_that_does_not_fit_and_an_unknown_name_are_not_sent(make: Maker, value: Any) -> None:
+    vehicle, kind = make(), ParamType.REAL32 if isinstance(value, float) else ParamType.INT32
+    name = next(param.name for param in vehicle.listed if param.type is kind)
+    async with talking(vehicle) as (conversation, session):
+        with pytest.raises(errors.UnknownParameter):
+            await write(session, "NO_SUCH", 1)
+        with pytest.raises(errors.UsageError):
+            await write(session, name, value)
+        assert not conversation.sent_of(ParamSet)
+        assert not session.writing
+        if isinstance(value, float):
+            result = await write(session, name, value, force=True)
+            assert not math.isfinite(float(result.actual))
 
 
 NUMBER = {"A": (5, ParamType.INT32)}
@@ -218,15 +207,7 @@ async def test_a_lost_acknowledgement_is_requested_again_and_a_lost_set_too() ->
         vehicle = PX4Vehicle()
         async with talking(endpoint := Tap(Air.symmetric([vehicle], delay=0.02))) as (_, session):
             await read(session, "MC_ROLL_P")
-            left = [2]
-
-            def lose(message: Message, kind: type = what, left: list[int] = left) -> bool:
-                if isinstance(message, kind) and left[0]:
-                    left[0] -= 1
-                    return False
-                return True
-
-            endpoint.up, endpoint.down = lose, lose
+            endpoint.up = endpoint.down = losing(2, lambda message, what=what: isinstance(message, what))  # type: ignore[misc]
             result = await write(session, "MC_ROLL_P", 3.5)
             assert (result.status, vehicle.param("MC_ROLL_P").value) == ("accepted", 3.5)
             assert result.attempts >= (3 if what is ParamSet else 2)
@@ -237,13 +218,7 @@ async def test_an_old_value_in_passing_proves_nothing_and_another_ones_is_no_adj
         vehicle = PX4Vehicle()
         async with talking(endpoint := Tap(Air.symmetric([vehicle], delay=0.1))) as (conversation, session):
             await read(session, "MC_ROLL_P")
-            sets = [0]
-
-            def first_is_lost(message: Message, sets: list[int] = sets) -> bool:
-                sets[0] += isinstance(message, ParamSet)
-                return not isinstance(message, ParamSet) or sets[0] > 1
-
-            endpoint.up = first_is_lost
+            endpoint.up = losing(1, lambda message: isinstance(message, ParamSet))
             async with meanwhile(write(session, "MC_ROLL_P", 3.5)) as results:
                 await anyio.sleep(0.05)
                 vehicle.load({"MC_ROLL_P": passing})  # as another station's set

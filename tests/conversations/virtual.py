@@ -265,6 +265,41 @@ class Tap:
         return [data for data in self.endpoint.data_to_send() if all(map(self.down, messages_in(data)))]
 
 
+class Silence(Tap):
+    """An endpoint that goes silent at a time, as a vehicle that crashes.
+
+    Args:
+        endpoint: the vehicle.
+        at: seconds on the event loop's clock.
+    """
+
+    def __init__(self, endpoint: Endpoint, at: float) -> None:
+        super().__init__(endpoint)
+        self.at = at
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take a frame, unless silent."""
+        if now < self.at:
+            self.endpoint.receive(data, now)
+
+    def data_to_send(self) -> list[bytes]:
+        """Return the frames of the vehicle; none while silent."""
+        data = self.endpoint.data_to_send()
+        return data if anyio.current_time() < self.at else []
+
+
+def losing(number: int, is_lost: Callable[[Message], bool]) -> Callable[[Message], bool]:
+    """Return a filter for a `Tap`, which loses the first messages of which a function says so."""
+    left = [number]
+
+    def passes(message: Message) -> bool:
+        drops = left[0] > 0 and is_lost(message)
+        left[0] -= drops
+        return not drops
+
+    return passes
+
+
 QUIET = Heartbeat(2, 0, system_status=4)
 """The heartbeat of a generic quadrotor."""
 
@@ -324,34 +359,3 @@ class Puppet:
         """Return the frames to send, and clear them."""
         out, self._out = self._out, []
         return out
-
-
-class Silence:
-    """An endpoint that goes silent at a time, as a vehicle that crashes.
-
-    Args:
-        endpoint: the vehicle.
-        at: seconds on the event loop's clock.
-    """
-
-    def __init__(self, endpoint: Endpoint, at: float) -> None:
-        self.at = at
-        self._endpoint = endpoint
-
-    def receive(self, data: bytes, now: float) -> None:
-        """Take a frame, unless silent."""
-        if now < self.at:
-            self._endpoint.receive(data, now)
-
-    def tick(self, now: float) -> None:
-        """Let the vehicle run."""
-        self._endpoint.tick(now)
-
-    def next_deadline(self) -> float | None:
-        """Return when the vehicle has something to do."""
-        return self._endpoint.next_deadline()
-
-    def data_to_send(self) -> list[bytes]:
-        """Return the frames of the vehicle; none while silent."""
-        data = self._endpoint.data_to_send()
-        return data if anyio.current_time() < self.at else []
