@@ -60,7 +60,7 @@ def test_every_wanted_parameter_gets_a_status() -> None:
         "ROLL_P = 4, unchanged",
         "PITCH_P 4.0 -> 6.5, set",
         "STAT_RUNTIME 5 -> 6, skipped: left out: it is counted by the vehicle itself",
-        "COUNT = 300, invalid: 300 does not fit INT8, which holds -128 to 127",
+        "COUNT 1 -> 300, invalid: 300 does not fit INT8, which holds -128 to 127",
         "PICTH_P = 1, skipped: not on this vehicle",
     ]
     (row,) = made.to_write
