@@ -207,7 +207,6 @@ class Capture(Tap):
         self._file: FileIO | None = None
         self._unwritten = bytearray()
         self._has_failed = False
-        self._something_to_write = anyio.Event()
 
     async def open(self) -> None:
         """Create the file.
@@ -217,12 +216,11 @@ class Capture(Tap):
         """
         try:
             self._file = await anyio.to_thread.run_sync(FileIO, self._path, "x")
-        except FileExistsError:
-            raise UsageError(
-                f"the log {self._path} exists and is not overwritten; name another file"
-            ) from None
         except OSError as error:
-            raise UsageError(f"the log {self._path} cannot be created: {error.strerror}") from error
+            problem = f"cannot be created: {error.strerror}"
+            if isinstance(error, FileExistsError):
+                problem = "exists and is not overwritten; name another file"
+            raise UsageError(f"the log {self._path} {problem}") from error
 
     def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
         """Queue received frames."""
@@ -234,15 +232,12 @@ class Capture(Tap):
         if self._has_failed or bears_key(frame):
             return
         self._unwritten += packed_time(time.time()) + unsign_frame(frame)
-        self._something_to_write.set()
         if len(self._unwritten) > UNWRITTEN_BYTES_MAX:
             self._fail("the disk is slower than the link")
 
     async def run(self) -> None:
         """Write the queued frames in batches, until cancelled or a write error."""
         while not self._has_failed:
-            await self._something_to_write.wait()
-            self._something_to_write = anyio.Event()
             await anyio.sleep(RECORDING_FLUSH_INTERVAL)
             await self._flush()
 
