@@ -12,13 +12,12 @@ from typing import Any, TypeAlias
 import pytest
 
 from paramclient import Encoding, ParamType, read_file
-from paramclient.model.values import Value
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle
 from paramclient.wire import frames, messages
 from tests.commands import Command, Put
 from tests.conversations.partial import Partial
 
-TABLE: dict[str, Value | tuple[ParamType, Value]] = {
+TABLE: dict[str, Any] = {
     "RTL_ALT": 1500,
     "WPNAV_SPEED": 500.0,
     "WPNAV_ACCEL": 100.0,
@@ -26,22 +25,14 @@ TABLE: dict[str, Value | tuple[ParamType, Value]] = {
     "EK2_ENABLE": (ParamType.INT8, 0),
     "BARO1_GND_PRESS": 94500.0,
 }
-GROUP: dict[str, Value | tuple[ParamType, Value]] = {"EK2_GPS_TYPE": (ParamType.INT8, 0)}
+FILE = "RTL_ALT,2500\nWPNAV_SPEED,750.5\nWPNAV_ACCEL,100\nCOMPASS_OFS_X,12.5\n"
+RECEIVER = "1/1 ArduPilot quadrotor, firmware 4.6.0-dev"
 File: TypeAlias = Callable[..., Path]
 """Writes a parameter file; returns its path."""
-
-FILE = """\
-RTL_ALT,2500
-WPNAV_SPEED,750.5
-WPNAV_ACCEL,100
-COMPASS_OFS_X,12.5
-"""
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> File:
-    """Write a parameter file; return its path."""
-
     def write(text: str = FILE, name: str = "quad.param") -> Path:
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
@@ -52,7 +43,8 @@ def file(tmp_path: Path) -> File:
 
 
 def copter(**options: Any) -> ArduPilotVehicle:
-    return ArduPilotVehicle(table=TABLE, groups={"EK2_ENABLE": GROUP}, live=(), **options)
+    groups = {"EK2_ENABLE": {"EK2_GPS_TYPE": (ParamType.INT8, 0)}}
+    return ArduPilotVehicle(table=TABLE, groups=groups, live=(), **options)
 
 
 def restarted(vehicle: ArduPilotVehicle) -> ArduPilotVehicle:
@@ -78,9 +70,8 @@ def test_apply_sets_and_verifies_values_that_differ(command: Command, put: Put, 
         ["COMPASS_OFS_X", "5.0", "12.5", "5.0", "skipped", left_out],
     ]
     announced, line, *notes = outcome.err.splitlines()
-    assert announced == "writing to 1/1 ArduPilot quadrotor, firmware 4.6.0-dev on udpin:0.0.0.0:14550"
-    receiver = "1/1 ArduPilot quadrotor, firmware 4.6.0-dev"
-    assert re.fullmatch(rf"{receiver}: 2 accepted, 1 unchanged, 1 skipped in \d\.\d s", line)
+    assert announced == f"writing to {RECEIVER} on udpin:0.0.0.0:14550"
+    assert re.fullmatch(rf"{RECEIVER}: 2 accepted, 1 unchanged, 1 skipped in \d\.\d s", line)
     assert notes == [
         "1/1 ardupilot: left out: 1 calibration; to write them: --include calibration",
         "1/1 ardupilot: ranges not checked: 2 of 2 have no metadata",
@@ -131,28 +122,21 @@ def test_invalid_values_and_mistyped_names_are_reported_before_anything_is_sent(
 def test_armed_vehicles_are_refused(command: Command, put: Put, file: File) -> None:
     vehicle = copter(armed=True)
     outcome = command("apply", put(vehicle), file())
-    assert (outcome.code, outcome.out) == (1, "")
-    assert "armed" in outcome.err
-    assert "writing to" not in outcome.err
-    assert vehicle.requests["PARAM_SET"] == 0
+    assert (outcome.code, outcome.out, vehicle.requests["PARAM_SET"]) == (1, "", 0)
+    assert ("armed" in outcome.err, "writing to" in outcome.err) == (True, False)
     would = command("apply", put(vehicle), file(), "--dry-run")
-    assert would.code == 1
-    assert "1/1 ardupilot is armed" in would.err
+    assert (would.code, "1/1 ardupilot is armed" in would.err) == (1, True)
     assert command("apply", put(vehicle), file(), "--dry-run", "--allow-armed").code == 0
     assert command("apply", put(vehicle), file(), "--allow-armed").code == 0
 
 
 def test_the_vehicle_reboots_only_with_the_option(command: Command, put: Put, file: File) -> None:
     wanted = file("EK2_ENABLE,1\nEK2_GPS_TYPE,3\n")
-    vehicle = copter()
-    outcome = command("apply", put(vehicle), wanted)
-    assert outcome.code == 0
+    outcome = command("apply", put(vehicle := copter()), wanted)
+    assert (outcome.code, vehicle.values["EK2_GPS_TYPE"]) == (0, 3)
     assert "1/1 ardupilot: takes effect after a reboot: EK2_ENABLE\n" in outcome.err
-    assert vehicle.values["EK2_GPS_TYPE"] == 3
-    vehicle = copter()
-    outcome = command("apply", put(vehicle), wanted, "--reboot", "--json")
-    assert outcome.code == 0
-    assert (outcome.json["reboots"], outcome.json["reboot_required"]) == (1, [])
+    outcome = command("apply", put(copter()), wanted, "--reboot", "--json")
+    assert (outcome.code, outcome.json["reboots"], outcome.json["reboot_required"]) == (0, 1, [])
 
 
 # Dry runs and confirmation
@@ -191,11 +175,8 @@ def test_dry_run_prints_the_stages_in_order(command: Command, put: Put, file: Fi
         ["EK2_ENABLE", "0", "1", "set", "switches that reveal parameters, takes effect after a reboot"],
         ["reboot", "the vehicle reboots"],
     ]
-    assert [row[:4] for row in outcome.rows[3:5]] == [
-        ["RTL_ALT", "1500", "2500", "set"],
-        ["WPNAV_SPEED", "500.0", "750.5", "set"],
-    ]
-    assert [row[0] for row in outcome.rows[5:]] == ["COMPASS_OFS_X", "EK2_NO_SUCH"]
+    names = [row[0] for row in outcome.rows[3:]]
+    assert names == ["RTL_ALT", "WPNAV_SPEED", "COMPASS_OFS_X", "EK2_NO_SUCH"]
     assert "; nothing was sent\n" in outcome.err
     assert vehicle.requests["PARAM_SET"] == 0
     assert vehicle.requests["COMMAND_LONG"] <= 2, "its identity may be requested, and no more"
@@ -204,8 +185,7 @@ def test_dry_run_prints_the_stages_in_order(command: Command, put: Put, file: Fi
     reported = command("apply", put(vehicle), wanted, "--dry-run", "--json").json
     planned = [(step["name"], step["value"]) for stage in reported["stages"] for step in stage["steps"]]
     assert planned == [("EK2_ENABLE", 1), ("RTL_ALT", 2500), ("WPNAV_SPEED", 750.5)]
-    assert reported["dry_run"] is True
-    assert reported["reboot_for"] == ["EK2_ENABLE"]
+    assert (reported["dry_run"], reported["reboot_for"]) == (True, ["EK2_ENABLE"])
 
 
 # backups
@@ -220,12 +200,9 @@ def test_the_backup_file_has_the_state_before(command: Command, put: Put, file: 
     assert read_file(kept).sets[0]["RTL_ALT"].value == 1500
     before = kept.read_bytes()
     outcome = command("apply", put(vehicle), file("RTL_ALT,99\n"), "--backup", backup)
-    assert outcome.code == 2
-    assert "exists already" in outcome.err
-    assert kept.read_bytes() == before
-    assert vehicle.values["RTL_ALT"] == 2500
-    back = command("restore", put(vehicle), kept)
-    assert back.code == 0
+    assert (outcome.code, "exists already" in outcome.err) == (2, True)
+    assert (kept.read_bytes(), vehicle.values["RTL_ALT"]) == (before, 2500)
+    assert command("restore", put(vehicle), kept).code == 0
     assert vehicle.values == copter().values
 
 
@@ -250,44 +227,35 @@ def test_a_backup_restores_the_calibration_of_the_very_same_vehicle(
         assert vehicle.values["COMPASS_OFS_X"] == 5.0
 
 
-def test_restore_reverts_the_last_apply(command: Command, put: Put, file: File) -> None:
+def test_restore_reverts_the_last_apply_and_says_what_it_undoes(
+    command: Command, put: Put, file: File
+) -> None:
     vehicle = copter()
     command("apply", put(vehicle), file(), "--include", "calibration")
     assert vehicle.values["COMPASS_OFS_X"] == 12.5
+    for value in (150, 100):  # has its old value again
+        assert command("set", put(vehicle), "WPNAV_ACCEL", value).code == 0
     would = command("restore", put(vehicle), "--dry-run")
-    assert would.code == 0
+    assert (would.code, vehicle.values["RTL_ALT"]) == (0, 2500)
     assert [row[:3] for row in would.rows[1:]] == [
         ["RTL_ALT", "2500", "1500"],
         ["WPNAV_SPEED", "750.5", "500.0"],
         ["COMPASS_OFS_X", "12.5", "5.0"],
     ]
-    assert vehicle.values["RTL_ALT"] == 2500
-    back = command("restore", put(vehicle))
-    assert back.code == 0
-    assert "the state: 6 parameters of 1/1 ardupilot from snapshot 1 of uid:" in back.err
+    said, state, *_ = would.err.splitlines()
+    assert re.fullmatch(
+        r"the state is that before the last apply, \d+ s ago \(snapshot 1\); changed since then: "
+        r"((COMPASS_OFS_X|WPNAV_SPEED|RTL_ALT) \d+ s ago(, )?){3}",
+        said,
+    )
+    assert state.startswith("the state: 6 parameters of 1/1 ardupilot from snapshot 1 of uid:")
+    back = command("restore", put(restarted(vehicle)), "--json")
+    assert back.json["complete"]
+    assert said[:40] in back.err
+    assert command("restore", put(vehicle)).code == 2
+    numbered = command("restore", put(vehicle), 1)
+    assert (numbered.code, "last apply" in numbered.err) == (0, False)
     assert vehicle.values == copter().values
-    vehicle.set_param("RTL_ALT", 77)  # as after an interrupted restore
-    assert command("restore", put(vehicle), 1).code == 0
-    assert vehicle.values == copter().values, "a restore is no apply that restore goes back behind"
-
-
-def test_restore_says_what_it_undoes(command: Command, put: Put, file: File) -> None:
-    vehicle = copter()
-    command("apply", put(vehicle), file("RTL_ALT,2500\n"))
-    assert command("set", put(vehicle), "WPNAV_SPEED", 600).code == 0
-    assert command("set", put(vehicle), "WPNAV_ACCEL", 150).code == 0
-    assert command("set", put(vehicle), "WPNAV_ACCEL", 100).code == 0  # has its old value again
-    would = command("restore", put(vehicle), "--dry-run")
-    assert re.search(
-        r"^the state is that before the last apply, \d+ s ago \(snapshot 1\); "
-        r"changed since then: .*RTL_ALT \d+ s ago$",
-        would.err,
-        re.MULTILINE,
-    ), would.err
-    reported = command("restore", put(restarted(vehicle)), "--json")
-    assert reported.json["complete"]
-    assert "the state is that before the last apply, " in reported.err
-    assert "last apply" not in command("restore", put(vehicle), 1).err
 
 
 def test_restore_does_not_undo_an_apply_twice(command: Command, put: Put, file: File) -> None:
@@ -298,8 +266,7 @@ def test_restore_does_not_undo_an_apply_twice(command: Command, put: Put, file: 
     sets = vehicle.requests["PARAM_SET"]
     for options in ((), ("--dry-run",)):
         again = command("restore", put(vehicle), *options)
-        assert again.code == 2
-        assert "a restore ran " in again.err
+        assert (again.code, "a restore ran " in again.err) == (2, True)
         assert "snapshot 1 for the state before that apply" in again.err
         assert "snapshot 2 for the state before that restore" in again.err
     assert vehicle.requests["PARAM_SET"] == sets
@@ -314,18 +281,14 @@ def test_restore_does_not_undo_an_apply_twice(command: Command, put: Put, file: 
 @pytest.mark.parametrize(
     ("when", "text"),
     [
-        ([], "the cache has no snapshot from before an apply to uid:"),
+        ([], "name the time of the state to restore, such as '2h ago', or a backup file"),
         (["2h ago"], " has no earlier state of uid:"),
         (["4"], " has no earlier state of uid:"),
     ],
 )
 def test_restore_needs_a_stored_state(command: Command, put: Put, when: list[str], text: str) -> None:
     outcome = command("restore", put(copter()), *when)
-    assert outcome.code == 5
-    assert text in outcome.err
-    assert when or outcome.err.endswith(
-        "; name the time of the state to restore, such as '2h ago', or a backup file\n"
-    )
+    assert (outcome.code, text in outcome.err) == (5, True)
     assert command("restore", put(copter()), *when, "--no-cache").code == 2
 
 
@@ -351,11 +314,10 @@ def test_all_vehicles_are_set_concurrently(command: Command, put: Put, file: Fil
     ]
     assert [vehicle.values["WPNAV_SPEED"] for vehicle in vehicles] == [100.0, 200.0, 300.0]
     assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [2500, 2500, 2500]
-    receivers = [f"{system}/1 ArduPilot quadrotor, firmware 4.6.0-dev" for system in (1, 2, 3)]
+    receivers = [f"{system}{RECEIVER[1:]}" for system in (1, 2, 3)]
     lines = outcome.err.splitlines()
-    assert [line for line in lines if line.startswith("writing")] == [
-        f"writing to {each} on udpin:0.0.0.0:14550" for each in receivers
-    ]
+    announced = [f"writing to {each} on udpin:0.0.0.0:14550" for each in receivers]
+    assert [line for line in lines if line.startswith("writing")] == announced
     assert [line.split(":")[0] for line in lines if " accepted" in line] == receivers
     assert sorted(path.name for path in tmp_path.glob("?.json")) == ["1.json", "2.json", "3.json"]
 
@@ -364,28 +326,34 @@ def test_a_failed_vehicle_does_not_stop_the_others(command: Command, put: Put, f
     air, vehicles = fleet()
     vehicles[1].armed = True
     outcome = command("apply", put(air), file(), "--vehicle", "all")
-    assert outcome.code == 1
-    assert "2/1 ardupilot: " in outcome.err
+    assert (outcome.code, "2/1 ardupilot: " in outcome.err) == (1, True)
     assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [2500, 1500, 2500]
     reported = command("apply", put(air), file(), "--vehicle", "all", "--json").json
     assert [each["system"] for each in reported["vehicles"]] == [1, 3]
     assert [each["system"] for each in reported["errors"]] == [2]
 
 
-def test_file_names_for_all_vehicles_need_a_placeholder(
+def test_one_file_or_state_for_all_vehicles_is_refused(
     command: Command, put: Put, file: File, tmp_path: Path
 ) -> None:
     air, vehicles = fleet()
-    outcome = command("apply", put(air), file(), "--vehicle", "all", "--backup", "same.param")
-    assert outcome.code == 2
-    assert "{uid} or {system}" in outcome.err
+    every = ["--vehicle", "all"]
     file("RTL_ALT,3\n", "1.param")
-    outcome = command("apply", put(air), tmp_path / "{system}.param", "--vehicle", "all")
-    assert outcome.code == 2
-    assert "2.param: no such file" in outcome.err
-    assert not any(vehicle.requests["PARAM_SET"] for vehicle in vehicles)
-    assert command("apply", put(air), file(), "--vehicle", "all", "--vehicle", 2).code == 2
+    for words, why in (
+        (["apply", file(), "--backup", "same.param"], "{uid} or {system}"),
+        (["apply", tmp_path / "{system}.param"], "2.param: no such file"),
+        (["apply", file(), "--vehicle", 2], "vehicle"),
+        (["restore", file()], "{uid} or {system} in its name"),
+        (["restore", 1], "snapshot 1 is of one vehicle"),
+        (["restore", "--backup", "same.json"], "{uid} or {system}"),
+        (["restore", "--no-cache"], "--no-cache"),
+        (["restore", tmp_path / "none-{system}.param"], "no such file"),
+    ):
+        name, *more = words
+        outcome = command(name, put(air), *more, *every)
+        assert (outcome.code, why in outcome.err) == (2, True), outcome.err
     assert command("apply", put(air), file()).code == 2
+    assert not any(vehicle.requests["PARAM_SET"] for vehicle in vehicles)
 
 
 def test_a_file_of_several_systems_has_a_set_for_each(command: Command, put: Put, file: File) -> None:
@@ -403,12 +371,10 @@ def test_all_vehicles_are_restored_each_to_its_own_state(
         vehicle.set_param("WPNAV_SPEED", 100.0 * vehicle.system)
     assert command("apply", put(air), file(), "--vehicle", "all").code == 0
     would = command("restore", put(air), "--vehicle", "all", "--dry-run")
-    assert would.code == 0
-    assert would.rows[0][0] == "vehicle"
+    assert (would.code, would.rows[0][0]) == (0, "vehicle")
     assert [vehicle.values["WPNAV_SPEED"] for vehicle in vehicles] == [750.5] * 3
     back = command("restore", put(air), "--vehicle", "all", "--backup", tmp_path / "{system}.json")
-    assert back.code == 0
-    assert back.rows[0][:2] == ["vehicle", "name"]
+    assert (back.code, back.rows[0][:2]) == (0, ["vehicle", "name"])
     assert [row[:5] for row in back.rows if row[1] == "WPNAV_SPEED"] == [
         [f"{system}/1", "WPNAV_SPEED", "750.5", f"{system}00.0", f"{system}00.0"] for system in (1, 2, 3)
     ]
@@ -424,19 +390,6 @@ def test_all_vehicles_are_restored_each_to_its_own_state(
     assert files.code == 0
     assert [each["complete"] for each in files.json["vehicles"]] == [True] * 3
     assert [vehicle.values["WPNAV_SPEED"] for vehicle in vehicles] == [750.5] * 3
-
-
-def test_one_state_is_not_restored_to_all_vehicles(command: Command, put: Put, file: File) -> None:
-    air, vehicles = fleet()
-    one = command("restore", put(air), file(), "--vehicle", "all")
-    assert (one.code, "{uid} or {system} in its name" in one.err) == (2, True)
-    number = command("restore", put(air), 1, "--vehicle", "all")
-    assert (number.code, "snapshot 1 is of one vehicle" in number.err) == (2, True)
-    assert command("restore", put(air), "--vehicle", "all", "--backup", "same.json").code == 2
-    assert command("restore", put(air), "--vehicle", "all", "--no-cache").code == 2
-    missing = command("restore", put(air), file().parent / "none-{system}.param", "--vehicle", "all")
-    assert (missing.code, "no such file" in missing.err) == (2, True)
-    assert not any(vehicle.requests["PARAM_SET"] for vehicle in vehicles)
 
 
 # Interruptions
@@ -462,16 +415,14 @@ def test_ctrl_c_prints_the_outcomes_so_far(command: Command, put: Put, file: Fil
     done = sum(value == 2 for value in vehicle.values.values())
     assert done < 40
     if as_json:
-        reported = outcome.json
-        assert (reported["complete"], reported["error"]) == (False, "interrupted")
-        assert 0 < len(reported["params"]) <= done
-        assert {row["status"] for row in reported["params"].values()} == {"unproven"}
+        assert (outcome.json["complete"], outcome.json["error"]) == (False, "interrupted")
+        shown = [row["status"] for row in outcome.json["params"].values()]
     else:
-        assert 0 < len(outcome.rows) - 1 <= done
-        assert outcome.rows[1][4:] == ["unproven", "acknowledged, and not read back"]
+        shown = [row[4] for row in outcome.rows[1:]]
         assert re.search(r"interrupted: \d+ values? not proven, .*; run it again", outcome.err)
-    again = command("apply", put(vehicle), wanted)
-    assert again.code == 0
+    assert set(shown) == {"unproven"}
+    assert len(shown) <= done
+    assert command("apply", put(vehicle), wanted).code == 0
     assert set(vehicle.values.values()) == {2}
 
 
