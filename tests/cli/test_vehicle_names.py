@@ -157,13 +157,11 @@ def cache(tmp_path: Path) -> Path:
 URL = "udpin:127.0.0.1:1"
 COMMANDS = [
     ["show", "NAME"],
-    ["show", "NAME", "--json"],
     ["history", "NAME"],
     ["history", "NAME", "--snapshots"],
     ["cache", "remove", "NAME"],
     ["save", "NAME", "FILE"],
     ["save", "NAME", "FILE", "--vehicle", "all"],
-    ["diff", "3", "NAME"],
     ["diff", "3", "3", "--base", "NAME"],
     ["diff", URL, "NAME"],
     ["apply", URL, "NAME", "--yes"],
