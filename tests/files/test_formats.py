@@ -370,16 +370,6 @@ def test_other_files_are_rejected(data: bytes, problem: str, line: int | None) -
     assert (problem in str(error), error.line) == (True, line), str(error)
 
 
-@given(data=st.binary(max_size=200), form=st.sampled_from([None, *FileFormat]))
-@settings(max_examples=300, deadline=None)
-def test_random_bytes_give_an_error_or_parameters(data: bytes, form: FileFormat | None) -> None:
-    try:
-        file = loads(data, file_format=form)
-    except FileError:
-        return
-    assert file.sets
-
-
 # Files of other programs
 
 

@@ -293,29 +293,3 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
         read_metadata(tmp_path / "none.json")
     with pytest.raises(FileError, match="cannot be read: not a regular file"):
         read_metadata(tmp_path)
-
-
-@given(st.data())
-def test_a_damaged_file_is_read_or_rejected(data: st.DataObject) -> None:
-    content = bytearray(data.draw(st.sampled_from(SAMPLES)))
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(content) - 1))
-        if data.draw(st.booleans()):
-            content[at] = data.draw(st.integers(0, 255))
-        else:
-            del content[at : at + data.draw(st.integers(1, 50))]
-            if not content:
-                break
-    try:
-        read = read_content(bytes(content), source="the file")
-    except FileError:
-        return
-    for info in read.values():
-        for value in (0, 1, 2.5, math.nan):
-            info.text(value)
-            info.problem(value)
-
-
-SAMPLES = [
-    content for path in (PX4, XML, JSON) for content in (path.read_bytes(), lzma.compress(path.read_bytes()))
-]

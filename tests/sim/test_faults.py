@@ -12,7 +12,7 @@ import pytest
 from paramclient.errors import CommandResult
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import frames, messages
-from tests.ground_station import LIST, Station, indices, names, read
+from tests.ground_station import LIST, Station, indices, names
 
 NO_INDEX = messages.NO_INDEX
 TEN = {f"P{number}": number for number in range(10)}
@@ -25,23 +25,6 @@ EVERY_KIND = pytest.mark.parametrize("kind", [GenericVehicle, PX4Vehicle, ArduPi
 def listed(station: Station, seconds: float = 0.5) -> list[int]:
     """Return the indices that a list sends."""
     return [index for index in indices(station.ask(LIST, seconds=seconds)) if index != NO_INDEX]
-
-
-@EVERY_KIND
-class TestDead:
-    def test_dead_parameters_are_counted_but_not_sent(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=TEN, dead=[3, "P7", 500], param_error=True)
-        station = Station(vehicle)
-        values = station.ask(LIST, seconds=0.5)
-        listed = [value.param_index for value in values if value.param_index != NO_INDEX]
-        assert listed == [0, 1, 2, 4, 5, 6, 8, 9]
-        assert {value.param_count for value in values} == {10}
-        dead = [read(index=3), read("P3"), read(index=7), read("P7")]
-        assert not station.ask(*dead, seconds=0.5)
-        station.send(*dead).wait(0.5)
-        assert not station.receive(messages.ParamError)
-        assert len(station.ask(read(index=2), read("P6"))) == 2
-        assert len(vehicle.params) == 10
 
 
 class TestWhenListed:
