@@ -123,7 +123,7 @@ def show_summaries(
         rows.append([address, autopilot, each.size, extended, hash_, synced, each.key])
     columns = ["component", "autopilot", "params", "extended", "hash", "synced", "key"]
     found = {"path": cache.place, "components": components}
-    show(found, columns, rows, json=json, right="params extended", empty="no table is in the cache")
+    show(found, columns, rows, json=json, empty="no table is in the cache")
     if not json:
         say(f"the cache is {cache.place}")
 
@@ -183,7 +183,7 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
             for each in found
         ]
         cells = ([row[name] for name in columns] for row in rows)
-        show({"tables": found}, columns, cells, json=options.json, right="params")
+        show({"tables": found}, columns, cells, json=options.json)
     return code
 
 
@@ -251,7 +251,6 @@ def history(
             ["id", "time", "component", "params", "hash", "reason"],
             map(_snapshot_cells, kept),
             json=options.json,
-            right="id params",
             empty="no snapshots: apply and restore store one before they write",
         )
         return ExitCode.DONE

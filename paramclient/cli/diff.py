@@ -120,7 +120,7 @@ def _print(outcome: Comparison, known: list[Metadata | None]) -> None:
         rows.append([entry.name, *cells, base, units, Coloured(_comparison_text(entry), style), changed])
     if rows:
         columns = ["name", "left", "right", "base", "units", "is", "changed"]
-        print_table(columns, rows, right="left right base")
+        print_table(columns, rows)
 
 
 def _shown(param: WrittenParam | None, metadata: Metadata | None) -> str | None:

@@ -159,7 +159,7 @@ _COLUMNS: Final = ("from", "what", "v", "frames/s", "bytes/s", "loss", "round tr
 
 
 def _print(found: JsonObject) -> None:
-    print_table(_COLUMNS, map(_row, found["components"]), right=" ".join(_COLUMNS[2:]))
+    print_table(_COLUMNS, map(_row, found["components"]))
     for line in _lines(found):
         print_line(line)
 

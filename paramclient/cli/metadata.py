@@ -225,7 +225,6 @@ def metadata_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
         ["vehicle", "firmware", "descriptions"],
         ((each.kind, each.firmware or "any", count) for each, count in counts),
         json=options.json,
-        right="descriptions",
         empty="no metadata was added",
     )
     return ExitCode.DONE

@@ -42,6 +42,14 @@ GAP: Final = "  "
 SENTENCE_WIDTH_MIN: Final = 20
 """Columns that sentences in the last column of a table take at least; in less they are hard to read."""
 
+_RIGHT_ALIGNED: Final = frozenset(
+    {
+        *("value", "index", "default", "before", "wanted", "requested", "actual", "now", "left", "right"),
+        *("base", "old", "new", "id", "params", "extended", "descriptions", "v", "frames/s", "bytes/s"),
+        *("loss", "round trip", "heartbeat"),
+    }
+)
+"""Headings of columns with numbers."""
 _STYLES: Final = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33"}
 """Codes of the styles of a terminal."""
 
@@ -132,15 +140,14 @@ def _fold(text: str, width: int) -> list[str]:
 # Tables
 
 
-def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: str = "") -> None:
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Print a table. On a terminal, sentences in the last column are wrapped at spaces.
 
     Args:
         columns: the headings.
         rows: the cells of each row; None is an empty cell. A column without any cell is left out.
-        right: the headings of the right-aligned columns, separated by spaces.
     """
-    print("\n".join(_table_lines(columns, rows, right.split(), is_terminal=sys.stdout.isatty())), flush=True)
+    print("\n".join(_table_lines(columns, [*rows], is_terminal=sys.stdout.isatty())), flush=True)
 
 
 def show(
@@ -149,14 +156,13 @@ def show(
     rows: Iterable[Sequence[object]],
     *,
     json: bool,
-    right: str = "",
     empty: str = "",
 ) -> None:
     """Print an object as JSON, or its rows as a table; if `empty` is given and there are none, say that."""
     if json:
         print_json(item)
     elif (cells := list(rows)) or not empty:
-        print_table(columns, cells, right=right)
+        print_table(columns, cells)
     else:
         say(empty)
 
@@ -167,14 +173,13 @@ def clear_screen() -> None:
 
 
 def _table_lines(
-    columns: Sequence[str], rows: Iterable[Sequence[object]], right: Sequence[str], *, is_terminal: bool
+    columns: Sequence[str], rows: Sequence[Sequence[object]], *, is_terminal: bool
 ) -> Iterable[str]:
     """Yield the lines of a table; for a terminal with styles, and with sentences that are wrapped."""
-    given = [*rows]
-    kept = [at for at in range(len(columns)) if not given or any(row[at] is not None for row in given)]
-    columns = [columns[at] for at in kept]
-    table: list[Sequence[object]] = [[Coloured(each, "bold") for each in columns]]
-    table += [[row[at] for at in kept] for row in given]
+    kept = [at for at in range(len(columns)) if not rows or any(row[at] is not None for row in rows)]
+    names = [columns[at] for at in kept]
+    table: list[list[object]] = [[Coloured(each, "bold") for each in names]]
+    table += [[row[at] for at in kept] for row in rows]
     texts = [["" if cell is None else printable(str(cell)) for cell in row] for row in table]
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     begin = sum(len(GAP) + each for each in widths[:-1])  # of the last column
@@ -183,10 +188,10 @@ def _table_lines(
         line = ""
         if is_terminal:
             cells[-1] = f"\n{' ' * begin}".join(_fold(cells[-1], left))
-        for cell, text, width, name in zip(row, cells, widths, columns, strict=True):
+        for cell, text, width, name in zip(row, cells, widths, names, strict=True):
             padding = " " * (width - len(text))
             shown = _styled(text, getattr(cell, "style", "")) if is_terminal else text
-            line += (padding + shown if name in right else shown + padding) + GAP
+            line += (padding + shown if name in _RIGHT_ALIGNED else shown + padding) + GAP
         yield line.rstrip()
 
 

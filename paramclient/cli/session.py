@@ -41,9 +41,6 @@ was lost in between."""
 FIRMWARE_TIMEOUT: Final = 0.5
 """Seconds to wait for the firmware version of the vehicle, to name it to the user or to find its metadata."""
 
-NUMBERS: Final = "value index default before wanted requested actual now stage"
-"""Right-aligned columns of tables."""
-
 Result = TypeVar("Result", covariant=True)
 
 _VEHICLE: Final = re.compile(
@@ -282,7 +279,7 @@ class Sessions(list[CommandSession]):
                 for cells in result.rows()
             ]
             if rows:
-                print_table(["vehicle", *found[0][1].columns], rows, right=NUMBERS)
+                print_table(["vehicle", *found[0][1].columns], rows)
         elif self.is_all:
             vehicles = [session.ids | result.as_json() for session, result in found]
             failures = [session.ids | {"error": str(error)} for session, error in failed]

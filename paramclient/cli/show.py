@@ -141,7 +141,7 @@ class _View:
             )
             for param in self._shown.values()
         )
-        print_table(columns, rows, right="value default")
+        print_table(columns, rows)
         if is_chosen and self._metadata is not None:
             for name in self._shown:
                 _print_description(name, self._metadata.find(name))
@@ -179,7 +179,7 @@ def search(
     if options.json:
         print_json({"results": [known.result_json(name) for name in names]})
     elif names:
-        print_table(["name", "value", "vehicle", "description"], map(known.cells, names), right="value")
+        print_table(["name", "value", "vehicle", "description"], map(known.cells, names))
     if not names:
         report(f"nothing found; {counted(len(known.names), 'parameter')} searched")
     if known.undescribed and not options.json:
@@ -228,7 +228,7 @@ def info(
         print_line("")
         columns = ("vehicle", "value", "meaning", "type", "default", "source", "heard", "key")
         rows = (_value_cells(table, spelled, info) for table in tables)
-        print_table(columns, rows, right="value default")
+        print_table(columns, rows)
     return ExitCode.DONE
 
 

@@ -502,4 +502,4 @@ def _check_finite(session: Session, name: str, value: Value, *, force: bool) -> 
     why = reason_against_non_finite(autopilot_name(session.identification.autopilot or 0))
     if why:
         not_sent = f"{name} = {value} was not sent to {session.channel}"
-        raise UsageError(f"{not_sent}: {why}. Force it to send it all the same.")
+        raise UsageError(f"{not_sent}: {why}. With force (--force) it is sent all the same.")

@@ -23,10 +23,10 @@ Print = Callable[..., list[str]]
 def printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Print:
     """Print a table on a terminal of some width; return its lines without styles."""
 
-    def call(width: int, columns: list[str], rows: list[tuple[object, ...]], right: str = "") -> list[str]:
+    def call(width: int, columns: list[str], rows: list[tuple[object, ...]]) -> list[str]:
         monkeypatch.setenv("COLUMNS", str(width))
         monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-        print_table(columns, rows, right=right)
+        print_table(columns, rows)
         return re.sub("\x1b\\[[0-9;]*m", "", capsys.readouterr().out).splitlines()
 
     return call
