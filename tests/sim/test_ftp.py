@@ -11,48 +11,37 @@ from paramclient.protocol import param_pck
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.param_pck import PackedParam
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
-from paramclient.wire import frames, messages
+from paramclient.wire import messages
+from tests.ground_station import Station
 
 PARAMS = b"@PARAM/param.pck"
 
 
-class Pilot:
+class Pilot(Station):
     """A ground station that sends one request after the other, each with its own sequence number."""
 
     def __init__(self, vehicle: Vehicle, *, component: int = 190) -> None:
+        super().__init__(vehicle)
         self.vehicle = vehicle
         self.component = component
-        self.now = 0.0
         self.sequence = 0
-        self.framer = frames.Framer(stream=False)
-        vehicle.tick(0.0)
-        vehicle.data_to_send()
 
-    def send(self, packet: Packet) -> None:
-        self.vehicle.receive(file_request(packet, component=self.component), self.now)
+    def request(self, packet: Packet) -> None:
+        message = messages.FileTransfer(0, 1, 1, packet.pack())
+        self.send_bytes(messages.encode(message, system=255, component=self.component, sequence=0))
 
     def listen(self, seconds: float) -> list[Packet]:
         """Return the responses within this time."""
-        end = self.now + seconds
-        received = []
-        while (due := self.vehicle.next_deadline()) is not None and due <= end:
-            self.now = max(due, self.now)
-            self.vehicle.tick(self.now)
-            for data in self.vehicle.data_to_send():
-                (frame,) = self.framer.receive(data)
-                message = messages.decode(frame)
-                if isinstance(message, messages.FileTransfer):
-                    assert (message.target_system, message.target_component) == (255, self.component)
-                    received.append(Packet.unpack(message.payload))
-        self.now = end
-        return received
+        answers = self.wait(seconds).receive(messages.FileTransfer)
+        assert all((each.target_system, each.target_component) == (255, self.component) for each in answers)
+        return [Packet.unpack(each.payload) for each in answers]
 
-    def ask(
+    def call(
         self, opcode: Opcode, data: bytes = b"", *, session: int = 3, offset: int = 0, size: int = 0
     ) -> Packet:
         """Send one request; return its only response."""
         self.sequence += 2
-        self.send(Packet(self.sequence, session, opcode, data, size, offset))
+        self.request(Packet(self.sequence, session, opcode, data, size, offset))
         (answer,) = self.listen(0.1)
         assert answer.sequence == self.sequence + 1
         assert answer.requested == opcode
@@ -60,14 +49,9 @@ class Pilot:
 
     def burst(self, *, session: int = 3, offset: int = 0, size: int = DATA_SIZE_MAX) -> list[Packet]:
         self.sequence += 2
-        self.send(Packet(self.sequence, session, Opcode.BURST_READ_FILE, size=size, offset=offset))
+        self.request(Packet(self.sequence, session, Opcode.BURST_READ_FILE, size=size, offset=offset))
         self.sequence += 10_000
         return self.listen(10.0)
-
-
-def file_request(packet: Packet, *, component: int = 190) -> bytes:
-    message = messages.FileTransfer(0, 1, 1, packet.pack())
-    return messages.encode(message, system=255, component=component, sequence=0)
 
 
 def refusal(answer: Packet) -> tuple[int, ...]:
@@ -80,9 +64,9 @@ def packed(vehicle: Vehicle) -> list[PackedParam]:
 
 
 def content_of(pilot: Pilot, query: bytes) -> param_pck.Pack:
-    pilot.ask(Opcode.OPEN_FILE_RO, PARAMS + query)
+    pilot.call(Opcode.OPEN_FILE_RO, PARAMS + query)
     data = b"".join(each.data for each in pilot.burst() if each.opcode == Opcode.ACK)
-    pilot.ask(Opcode.TERMINATE_SESSION)
+    pilot.call(Opcode.TERMINATE_SESSION)
     return param_pck.decode(data)
 
 
@@ -109,34 +93,34 @@ def test_param_pck_has_the_current_values() -> None:
 def test_checksums_of_files() -> None:
     pilot = Pilot(ArduPilotVehicle())
     pilot.vehicle.files["logs/1.bin"] = b"abc"
-    checksum = pilot.ask(Opcode.CALC_FILE_CRC32, b"logs/1.bin")
+    checksum = pilot.call(Opcode.CALC_FILE_CRC32, b"logs/1.bin")
     assert int.from_bytes(checksum.data, "little") == crc32_px4(b"abc")
-    assert refusal(pilot.ask(Opcode.CALC_FILE_CRC32, b"nothing")) == (FileErrorCode.FILE_NOT_FOUND,)
+    assert refusal(pilot.call(Opcode.CALC_FILE_CRC32, b"nothing")) == (FileErrorCode.FILE_NOT_FOUND,)
 
 
 class TestSessions:
     def test_px4_closes_a_session_after_11_s(self) -> None:
         pilot = Pilot(PX4Vehicle())
         pilot.vehicle.files["a"] = b"a"
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        pilot.call(Opcode.OPEN_FILE_RO, b"a")
         pilot.listen(10.5)
-        assert pilot.ask(Opcode.READ_FILE, session=0, size=1).data == b"a"
+        assert pilot.call(Opcode.READ_FILE, session=0, size=1).data == b"a"
         pilot.listen(11.0)
-        assert refusal(pilot.ask(Opcode.READ_FILE, session=0, size=1)) == (FileErrorCode.INVALID_SESSION,)
-        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a").opcode == Opcode.ACK
+        assert refusal(pilot.call(Opcode.READ_FILE, session=0, size=1)) == (FileErrorCode.INVALID_SESSION,)
+        assert pilot.call(Opcode.OPEN_FILE_RO, b"a").opcode == Opcode.ACK
 
     def test_px4_assigns_session_numbers(self) -> None:
         pilot = Pilot(PX4Vehicle(ftp=True))
         pilot.vehicle.files["a"] = b"a"
-        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3).session == 0
-        assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)) == (
+        assert pilot.call(Opcode.OPEN_FILE_RO, b"a", session=3).session == 0
+        assert refusal(pilot.call(Opcode.OPEN_FILE_RO, b"a", session=4)) == (
             FileErrorCode.NO_SESSIONS_AVAILABLE,
         )
-        assert refusal(pilot.ask(Opcode.TERMINATE_SESSION, session=3)) == (FileErrorCode.INVALID_SESSION,)
-        assert pilot.ask(Opcode.TERMINATE_SESSION, session=0).opcode == Opcode.ACK
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
-        assert pilot.ask(Opcode.RESET_SESSIONS, session=9).opcode == Opcode.ACK
-        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a").opcode == Opcode.ACK
+        assert refusal(pilot.call(Opcode.TERMINATE_SESSION, session=3)) == (FileErrorCode.INVALID_SESSION,)
+        assert pilot.call(Opcode.TERMINATE_SESSION, session=0).opcode == Opcode.ACK
+        pilot.call(Opcode.OPEN_FILE_RO, b"a")
+        assert pilot.call(Opcode.RESET_SESSIONS, session=9).opcode == Opcode.ACK
+        assert pilot.call(Opcode.OPEN_FILE_RO, b"a").opcode == Opcode.ACK
 
 
 class TestPace:
@@ -144,21 +128,21 @@ class TestPace:
         pilot = Pilot(ArduPilotVehicle())
         pilot.vehicle.files["a"] = b"a"
         request = Packet(7, 3, Opcode.OPEN_FILE_RO, b"a")
-        pilot.send(request)
-        pilot.send(request)
+        pilot.request(request)
+        pilot.request(request)
         first, second = pilot.listen(0.1)
         assert first == second
         assert first.opcode == Opcode.ACK
         other = Pilot(pilot.vehicle, component=191)
         other.now = pilot.now
-        other.send(request)
+        other.request(request)
         (answer,) = other.listen(0.1)
         assert refusal(answer) == (FileErrorCode.FAIL,)
 
     def test_px4_ends_a_burst_after_168_blocks(self) -> None:
         pilot = Pilot(PX4Vehicle())
         pilot.vehicle.files["a"] = bytes(50_000)
-        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        pilot.call(Opcode.OPEN_FILE_RO, b"a")
         blocks = pilot.burst(session=0, size=100)
         assert [each.burst_complete for each in blocks] == [False] * 167 + [True]
         assert {len(each.data) for each in blocks} == {239}
@@ -169,8 +153,8 @@ class TestPace:
 class TestSwitches:
     def test_newer_px4_has_a_param_pck(self) -> None:
         old, new = Pilot(PX4Vehicle()), Pilot(PX4Vehicle(ftp=True))
-        assert refusal(old.ask(Opcode.OPEN_FILE_RO, PARAMS)) == (FileErrorCode.FILE_NOT_FOUND,)
-        assert new.ask(Opcode.OPEN_FILE_RO, PARAMS).opcode == Opcode.ACK
+        assert refusal(old.call(Opcode.OPEN_FILE_RO, PARAMS)) == (FileErrorCode.FILE_NOT_FOUND,)
+        assert new.call(Opcode.OPEN_FILE_RO, PARAMS).opcode == Opcode.ACK
         data = b"".join(each.data for each in new.burst(session=0) if each.opcode == Opcode.ACK)
         assert list(param_pck.decode(data).entries) == packed(new.vehicle)
 
@@ -179,7 +163,7 @@ class TestSwitches:
     )
     def test_without_mavftp_requests_are_not_answered(self, vehicle: Vehicle) -> None:
         pilot = Pilot(vehicle)
-        pilot.send(Packet(1, 0, Opcode.OPEN_FILE_RO, PARAMS))
+        pilot.request(Packet(1, 0, Opcode.OPEN_FILE_RO, PARAMS))
         assert pilot.listen(1.0) == []
         with pytest.raises(UsageError, match="this vehicle has no MAVFTP"):
             assert vehicle.files
