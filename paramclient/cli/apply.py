@@ -51,6 +51,7 @@ from paramclient.provision import (
     plan,
 )
 from paramclient.provision.apply_restore import load_restore_point, restore_categories
+from paramclient.provision.apply_rules import READ_ONLY
 from paramclient.provision.execution import run as run_apply
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.planning import Rows
@@ -457,7 +458,11 @@ class _Job:
         if session.component.is_armed and not self.options["allow_armed"]:
             report(f"{session.label} is armed; nothing would be set now without --allow-armed")
             code = ExitCode.INCOMPLETE
-        return ExitCode.USAGE if self._is_refused else code
+        if self._is_refused:
+            names = first_of([*made.problems], LINE_NAMES_MAX)
+            report(f"{session.label}: nothing would be sent without --partial: {names}")
+            code = ExitCode.USAGE
+        return code
 
     def _say_result(self) -> int:
         """Print what became of the vehicle; return the exit code."""
@@ -480,7 +485,7 @@ class _Job:
         left_out = Counter(
             row.category
             for row in shown.of(ApplyStatus.SKIPPED)
-            if row.category in CATEGORIES and row.differs
+            if row.category in CATEGORIES and row.category != READ_ONLY and row.differs
         )
         label = self.session.label
         if left_out:

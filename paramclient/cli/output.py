@@ -349,6 +349,6 @@ def report_all(found: Iterable[ParamClientError], prefix: str = "") -> int:
     """Print every error; return the exit code for all of them."""
     worst = ExitCode.DONE
     for error in found:
-        report(f"{prefix}{error}")
+        report(f"{prefix}{text_of(error, takes_all=False)}")
         worst = max(worst, code_of(error))
     return worst

@@ -113,7 +113,8 @@ def test_invalid_values_and_mistyped_names_are_reported_before_anything_is_sent(
     assert "--partial skips these" in outcome.err
     assert "writing to" not in outcome.err
     assert vehicle.requests["PARAM_SET"] == 0
-    assert command("apply", put(vehicle), wrong, "--dry-run").code == 2
+    would = command("apply", put(vehicle), wrong, "--dry-run")
+    assert (would.code, "nothing would be sent without --partial: " in would.err) == (2, True)
     outcome = command("apply", put(vehicle), wrong, "--partial")
     assert outcome.code == 1
     assert vehicle.values["RTL_ALT"] == 2500
