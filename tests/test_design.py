@@ -56,7 +56,7 @@ CLOCKS = {"datetime.now", "datetime.today", "datetime.utcnow", "date.today"}
 
 LIBRARIES = {
     "pymavlink": ("wire.frames", "logs"),
-    "anyio": ("protocol", "client", "links", "provision", "metadata", "logs", "sync", "service", "cli"),
+    "anyio": ("protocol", "client", "links", "provision", "metadata", "logs", "service", "cli"),
     "asyncio": ("cli", "__main__", "service", "client", "links"),
     "trio": ("client",),
     "serialx": ("links",),

@@ -385,7 +385,10 @@ class TcpIn(SocketLink):
         while not batch:
             await self._any_readable(self._selector, opening)
             for key, _ in self._selector.select(0):
-                batch += self._read(key.data) if key.data in self._clients else self._accept()
+                if key.data is None:
+                    self._accept(self._selector)
+                else:
+                    batch += self._read(key.data)
         return batch
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
@@ -444,24 +447,23 @@ class TcpIn(SocketLink):
                 tasks.start_soon(wait, key.fileobj)
         self._check(opening)
 
-    def _accept(self) -> list[tuple[Peer, bytes]]:
-        """Accept a waiting connection, if there is one. It has not sent anything yet."""
+    def _accept(self, selector: selectors.BaseSelector) -> None:
+        """Accept a waiting connection, if there is one."""
         try:
             client, address = self._socket.accept()
         except (BlockingIOError, ConnectionError):
-            return []
+            return
         except OSError as error:
             raise self._error(f"cannot accept: {reason(error)}") from error
-        if self._selector is None or len(self._clients) >= CONNECTIONS_MAX:
+        if len(self._clients) >= CONNECTIONS_MAX:
             client.close()
-            return []
+            return
         _set_up(client)
         self._accepted += 1
         peer = (self._accepted, *address)
         self._clients[peer] = client
-        self._selector.register(client, selectors.EVENT_READ, peer)
+        selector.register(client, selectors.EVENT_READ, peer)
         self.accepted(peer)
-        return []
 
     def _read(self, peer: Peer) -> list[tuple[Peer, bytes]]:
         """Read what a connection has received; empty bytes are its end."""
