@@ -4,9 +4,9 @@
 - Subcommands: `read_commands` (fetch, get, watch), `set_command` with `writes`, `reset_command`, `apply`
   (apply, restore), `show` (show, search, info), `cached` (cache, import, history), `save`, `diff`,
   `metadata`, `link` (link, ports), `check`, `signing` and `serve` (serve, token, sim).
-- `session`: open links with the vehicles of --vehicle, on which a subcommand works. `options`: options.
+- `session`: open links with the vehicles of --vehicle, on which a subcommand works, and the parameters that
+  it reads there. `options`: options.
 - `sources`: the parameters that an argument names: of a file, a link or the cache.
-- `param_names`: names and patterns of parameters.
 - `metadata`: descriptions and defaults that a subcommand uses.
 - `output`: tables, lines, the status line, exit codes.
 - `json_output`: JSON.

@@ -25,7 +25,7 @@ from paramclient.cli.output import (
     say,
     show,
 )
-from paramclient.cli.param_names import check_given
+from paramclient.cli.session import check_given
 from paramclient.errors import FileError, LinkError, ParamClientError, UsageError
 from paramclient.files.conversion import kind_of
 from paramclient.logs.imports import ImportedTable, import_log, import_onboard_log

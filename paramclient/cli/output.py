@@ -12,7 +12,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
@@ -165,6 +165,11 @@ def show(
         print_table(columns, cells)
     else:
         say(empty)
+
+
+def cells_of(objects: Mapping[str, Mapping[str, object]], *members: str) -> Iterator[list[object]]:
+    """Yield the row of each object of JSON: its name, and these members."""
+    return ([name, *map(each.get, members)] for name, each in objects.items())
 
 
 def clear_screen() -> None:

@@ -10,22 +10,21 @@ from typing import ClassVar, Final
 
 import anyio
 
-from paramclient.cli.json_output import JsonObject, fetch_json, known_members, param_json, param_value
+from paramclient.cli.json_output import JsonObject, fetch_json, param_json, param_value
 from paramclient.cli.metadata import (
     MetadataChoice,
     defaults_in,
     info_of,
     known_of_session,
-    meaning_of,
     no_defaults,
     say_sources,
-    units_of,
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     LINE_NAMES_MAX,
     ExitCode,
     by_index,
+    cells_of,
     local_time,
     milliseconds,
     print_json,
@@ -34,8 +33,7 @@ from paramclient.cli.output import (
     report_all,
     say,
 )
-from paramclient.cli.param_names import check_given, get_chosen
-from paramclient.cli.session import CommandSession, Sessions, sessions
+from paramclient.cli.session import CommandSession, Sessions, check_given, get_chosen, sessions
 from paramclient.client.client import Event
 from paramclient.errors import ParamClientError, VehicleError
 from paramclient.links import ReplayLink
@@ -184,7 +182,9 @@ class _Fetched:
         """Yield the cells of each parameter."""
         for param in self.params:
             default = default_of(param, self.described.get(param.name)) if self.shows_defaults else None
-            yield *_cells(param), param.trust, default and format_value(default.value, param.type)
+            value, kind = format_value(param.settable, param.type), param.type.name
+            changed = default and format_value(default.value, param.type)
+            yield param.name, value, kind, param.index, param.trust, changed
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,13 +215,7 @@ class _Read:
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the cells of each parameter, with meaning and units if metadata is known."""
-        for param in self.params:
-            meaning = meaning_of(self.metadata, param.name, param.settable)
-            yield *_cells(param), meaning, units_of(self.metadata, param.name)
-
-
-def _cells(param: Param) -> Sequence[object]:
-    return param.name, format_value(param.settable, param.type), param.type.name, param.index
+        return cells_of(self.as_json()["params"], "value", "type", "index", "text", "units")
 
 
 # watch
@@ -263,7 +257,7 @@ async def _watch(session: CommandSession, given: Sequence[str], found: Sessions)
     async def print_events() -> None:
         async for event in events:
             if event.kind != "discovered" and event.component.node is component.node:
-                _print(session, _event_json(event), _event_text(event))
+                _print(session, *_event(event))
 
     with anyio.move_on_after(session.deadline.left()):
         async with task_group() as tasks:  # both end with a log
@@ -273,7 +267,8 @@ async def _watch(session: CommandSession, given: Sequence[str], found: Sessions)
                 if change.kind == "first" and (is_first is None or change.name in is_first):
                     is_first = is_first and is_first - {change.name}
                 elif choice.has(change.name):
-                    _print(session, _change_json(change), f"{session.prefix}{_change_text(change)}")
+                    item, text = _change(change)
+                    _print(session, item, f"{session.prefix}{text}")
     return ExitCode.DONE
 
 
@@ -287,33 +282,26 @@ def _print(session: CommandSession, item: JsonObject, text: str) -> None:
         print_line(f"{local_time(now)}  {text}")
 
 
-def _change_json(change: Change) -> JsonObject:
-    values = {"old": param_value(change.old), "new": param_value(change.new)}
-    return {"name": change.name, **values, "by": change.by, "kind": change.kind}
-
-
-def _event_json(event: Event) -> JsonObject:
-    component, more = event.component, {}
-    if event.kind == "resynced":
-        more = {"changed": event.changed, "hash": hash_text(event.hash)}
-    ids = {"system": component.system, "component": component.component}
-    return {"event": event.kind, **ids, **known_members(silence_s=rounded(event.silence)), **more}
-
-
-def _change_text(change: Change) -> str:
-    old, new = (
-        "none" if param is None else format_value(param.settable, param.type)
-        for param in (change.old, change.new)
-    )
+def _change(change: Change) -> tuple[JsonObject, str]:
+    """Return a change as JSON and in words."""
+    old, new = param_value(change.old), param_value(change.new)
+    words = f"{'none' if old is None else old} -> {'none' if new is None else new}"
     if change.kind == "added":
-        return f"{change.name}  added: {new}  ({change.by})"
-    if change.kind == "removed":
-        return f"{change.name}  removed, was {old}  ({change.by})"
-    return f"{change.name}  {old} -> {new}  ({change.by})"
+        words = f"added: {new}"
+    elif change.kind == "removed":
+        words = f"removed, was {old}"
+    found = {"name": change.name, "old": old, "new": new, "by": change.by, "kind": change.kind}
+    return found, f"{change.name}  {words}  ({change.by})"
 
 
-def _event_text(event: Event) -> str:
-    more = "" if event.silence is None else f" after {event.silence:.1f} s without a message"
+def _event(event: Event) -> tuple[JsonObject, str]:
+    """Return an event as JSON and in words."""
+    component, words = event.component, ""
+    found: JsonObject = {"event": event.kind, "system": component.system, "component": component.component}
+    if event.silence is not None:
+        found["silence_s"] = rounded(event.silence)
+        words = f" after {event.silence:.1f} s without a message"
     if event.kind == "resynced":
-        more = f": {counted(len(event.changed), 'value')} had changed"
-    return f"{event.component.system}/{event.component.component} {event.kind}{more}"
+        found |= {"changed": event.changed, "hash": hash_text(event.hash)}
+        words = f": {counted(len(event.changed), 'value')} had changed"
+    return found, f"{component.system}/{component.component} {event.kind}{words}"

@@ -19,12 +19,11 @@ from paramclient.cli.metadata import (
 )
 from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import LINE_NAMES_MAX, report, say
-from paramclient.cli.param_names import check_given, get_chosen
-from paramclient.cli.session import CommandSession
+from paramclient.cli.session import CommandSession, check_given, get_chosen
 from paramclient.errors import NoReply, UsageError, VehicleError
 from paramclient.metadata import Metadata
 from paramclient.model.names import counted, first_of, is_pattern
-from paramclient.model.paramset import ParamSet, WrittenParam, default_of
+from paramclient.model.paramset import ParamSet, default_of
 from paramclient.model.values import Param
 
 _OPTIONS: Final = ApplyFlags()
@@ -59,30 +58,25 @@ async def reset(
     chosen = check_given(names)
 
     async def load(session: CommandSession) -> State:
-        fetched, is_part = await session.fetch(), False
+        missing = (await session.fetch()).missing
         params, errors = await get_chosen(session, chosen or ["*"], is_fetched=True)
         for error in errors.values():
             raise error
-        if fetched.missing and any(map(is_pattern, chosen or "*")):
-            is_part = True
-            report(f"{session.prefix}incomplete: {counted(len(fetched.missing), 'parameter')} not received")
         known = defaults_in(await _known(session, metadata, params), [each.name for each in params])
-        found = {param: default_of(param, known.get(param.name)) for param in params}
-        without = [param.name for param, default in found.items() if default is None]
-        if len(without) == len(found):
-            is_part = True
-            report(no_defaults())
-        elif without and not changed:
-            is_part = True
-            listed = first_of(without, LINE_NAMES_MAX)
-            report(f"{session.prefix}not written, as their default is not known: {listed}")
+        found = {param.name: default_of(param, known.get(param.name)) for param in params}
+        wanted = {name: default.value for name, default in found.items() if default is not None}
+        if not wanted:
+            raise VehicleError(no_defaults(), *session.component.address)
         say_sources(session.label, found.values())
-        wanted = {
-            param.name: WrittenParam(param.name, default.value, param.type)
-            for param, default in found.items()
-            if default is not None
-        }
-        return State(ParamSet(wanted, source="the firmware's defaults"), is_part=is_part)
+        problems = []
+        if missing and any(map(is_pattern, chosen or "*")):
+            problems.append(f"incomplete: {counted(len(missing), 'parameter')} not received")
+        if (without := [name for name in found if name not in wanted]) and not changed:
+            listed = first_of(without, LINE_NAMES_MAX)
+            problems.append(f"not written, as their default is not known: {listed}")
+        for problem in problems:
+            report(f"{session.prefix}{problem}")
+        return State(ParamSet(wanted, source="the firmware's defaults"), is_part=bool(problems))
 
     flags = replace(options, include=(*options.include, *(name.upper() for name in chosen)))
     return await run(url, flags, load, metadata=metadata)

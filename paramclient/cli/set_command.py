@@ -14,8 +14,7 @@ from cyclopts.validators import Number
 from paramclient.cli.metadata import MetadataChoice, info_of, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import can_ask, confirm, report
-from paramclient.cli.param_names import get_chosen, spelling
-from paramclient.cli.session import CommandSession, sessions
+from paramclient.cli.session import CommandSession, get_chosen, sessions, spelling
 from paramclient.cli.writes import SetJob, write_all
 from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError

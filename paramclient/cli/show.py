@@ -22,15 +22,22 @@ from paramclient.cli.metadata import (
     defaults_in,
     info_of,
     known_of_sets,
-    meaning_of,
     no_defaults,
     say_sources,
-    units_of,
 )
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import ExitCode, local_time, print_json, print_line, print_table, report, say
-from paramclient.cli.param_names import check_given
-from paramclient.cli.sources import check_link, described, value_text
+from paramclient.cli.output import (
+    ExitCode,
+    cells_of,
+    local_time,
+    print_json,
+    print_line,
+    print_table,
+    report,
+    say,
+)
+from paramclient.cli.session import check_given
+from paramclient.cli.sources import check_link, described
 from paramclient.errors import UsageError
 from paramclient.files.formats import address
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo
@@ -129,19 +136,8 @@ class _View:
     def print(self, *, is_chosen: bool) -> None:
         """Print the table, the descriptions of chosen parameters, and a line about the set on stderr."""
         columns = ("name", "value", "default", "type", "meaning", "units", "comment")
-        rows = (
-            (
-                param.name,
-                value_text(param),
-                None if param.default is None else value_text(replace(param, value=param.default)),
-                None if param.type is None else param.type.name,
-                meaning_of(self._metadata, param.name, param.settable),
-                units_of(self._metadata, param.name),
-                param.comment or None,
-            )
-            for param in self._shown.values()
-        )
-        print_table(columns, rows)
+        members = ("value", "default", "type", "text", "units", "comment")
+        print_table(columns, cells_of(self.as_json(is_chosen=is_chosen)["params"], *members))
         if is_chosen and self._metadata is not None:
             for name in self._shown:
                 _print_description(name, self._metadata.find(name))
@@ -207,28 +203,35 @@ def info(
     info = known.info(spelled)  # also that of a group, FOO{n}_BAR, which is not among the names
     if info is None:
         NameChoice([name]).choose(known.names, " of the cache")
-    default = None if info is None else info.default
     tables = known.having(spelled)
+    vehicles = [
+        {
+            **taken(table, "key", "system", "component"),
+            "autopilot": autopilot_name(table.autopilot),
+            "heard_at": time_text(table.heard_at[spelled]),
+            "param": table_param_json(table.params[spelled], info),
+        }
+        for table in tables
+    ]
     if options.json:
-        vehicles = [
-            {
-                **taken(table, "key", "system", "component"),
-                "autopilot": autopilot_name(table.autopilot),
-                "heard_at": time_text(table.heard_at[spelled]),
-                "param": table_param_json(table.params[spelled], described=default),
-            }
-            for table in tables
-        ]
         print_json({"name": spelled, "metadata": info and info_json(info), "vehicles": vehicles})
         return ExitCode.DONE
     _print_description(spelled, info)
     if info is None and known.undescribed:
         say(f"no metadata of {known.undescribed} is known: {METADATA_HINT}")
-    if tables:
+    if vehicles:
         print_line("")
-        columns = ("vehicle", "value", "meaning", "type", "default", "source", "heard", "key")
-        rows = (_value_cells(table, spelled, info) for table in tables)
-        print_table(columns, rows)
+        members = ("value", "text", "type", "default", "default_source")
+        rows = (
+            (
+                f"{table.system}/{table.component}",
+                *map(each["param"].get, members),
+                local_time(table.heard_at[spelled]),
+                table.key,
+            )
+            for table, each in zip(tables, vehicles, strict=True)
+        )
+        print_table(("vehicle", "value", "meaning", "type", "default", "source", "heard", "key"), rows)
     return ExitCode.DONE
 
 
@@ -294,22 +297,6 @@ def _rank(name: str, info: ParamInfo | None, lowered_words: Sequence[str]) -> in
         if all(word in text for word in lowered_words):
             return rank
     return None
-
-
-def _value_cells(table: CachedComponent, name: str, info: ParamInfo | None) -> Sequence[object]:
-    """Return the row of the value of one vehicle."""
-    param = table.params[name]
-    default = default_of(param, None if info is None else info.default)
-    return (
-        f"{table.system}/{table.component}",
-        _value(table, name),
-        info and info.text(param.settable),
-        param.type.name,
-        default and format_value(default.value, param.type),
-        default and default.source,
-        local_time(table.heard_at[name]),
-        table.key,
-    )
 
 
 def _value(table: CachedComponent, name: str) -> str:
