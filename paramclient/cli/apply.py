@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial as bind
-from pathlib import Path
 from typing import ClassVar, Final, Self, TypeAlias
 
 import anyio
@@ -272,12 +271,11 @@ async def run(
         The exit code.
 
     Raises:
-        UsageError: --backup gives several vehicles one file.
-        FileError: a file of --backup exists, or a file of a vehicle does not.
+        FileError: a file of --backup exists, or names several vehicles' backups, or a vehicle has no file.
     """
     check_pattern("the file of --backup", flags.backup, flags)
     async with sessions(url, flags, writes=True) as found:
-        jobs: dict[CommandSession, _Job] = {}
+        jobs, backups = dict[CommandSession, _Job](), set[str]()
 
         async def prepare(session: CommandSession) -> None:
             state = await load(session)
@@ -288,16 +286,18 @@ async def run(
                 reboot=flags.reboot,
                 allow_armed=flags.allow_armed,
             )
+            if flags.backup is not None:
+                options["backup"] = path = await fill_pattern(flags.backup, session)
+                if path in backups or await anyio.Path(path).exists():
+                    message = "exists already, or is the backup of another vehicle; choose another name"
+                    raise FileError(message, source=path)
+                backups.add(path)
             jobs[session] = _Job(session, state, options, is_restore)
 
         await found.work(prepare)
         for error in found.errors.values():
             if isinstance(error, FileError):  # before anything is sent to another vehicle
                 raise error
-        for session, job in jobs.items():
-            if flags.backup is not None:
-                job.options["backup"] = await fill_pattern(flags.backup, session)
-        _check_backups([str(job.options["backup"]) for job in jobs.values() if "backup" in job.options])
         if flags.dry_run or (not flags.yes and not flags.json and can_ask()):
             plans = await found.work(lambda session: jobs[session].make_plan())
             has_work = any(job.has_work for job in jobs.values())
@@ -310,21 +310,6 @@ async def run(
         if flags.no_cache and flags.backup is None and not url.startswith("sim:"):
             say("the state before is not stored: --no-cache is given, and --backup is not")
         return await write_all(found, jobs)
-
-
-def _check_backups(names: Sequence[str]) -> None:
-    """Check that the names are of new files. An existing file may be the only copy of an earlier state.
-
-    Raises:
-        UsageError: two names are the same.
-        FileError: a file exists.
-    """
-    for name in names:
-        if names.count(name) > 1:
-            raise UsageError(f"--backup names one file for several vehicles: {name}")
-        if Path(name).exists():
-            message = "exists already, and may be the backup of an earlier run; choose another name"
-            raise FileError(message, source=name)
 
 
 @dataclass(eq=False)
