@@ -417,13 +417,6 @@ class FileTransferError(VehicleError):
         self.errno = errno
         self.reason = FileErrorCode.name_of(code)
 
-    @property
-    def is_not_found(self) -> bool:
-        """Whether the file does not exist; servers use two codes for it (ENOENT is 2 on all of them)."""
-        return self.code == FileErrorCode.FILE_NOT_FOUND or (
-            self.code == FileErrorCode.FAIL_ERRNO and self.errno == 2
-        )
-
 
 class AnotherVehicle(VehicleError):
     """Another vehicle than the expected one responded with the system id.

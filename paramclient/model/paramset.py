@@ -23,7 +23,6 @@ from paramclient.model.values import (
     check_value,
     format_value,
     from_bits,
-    same_bits,
 )
 
 
@@ -95,20 +94,6 @@ class WrittenParam:
         """
         # four bytes of a raw value also if the type has fewer
         return int(self.value) if self.is_raw else bits_of(self.value, number)
-
-    def is_held_by(self, param: Param) -> bool:
-        """Return whether a vehicle's parameter has this value, compared in the vehicle's type.
-
-        −0 equals 0, NaN equals only the same NaN, and a float is rounded to float32 first. False if the
-        value does not fit the type. Raw bytes equal only the same raw bytes, as their number is unknown.
-        """
-        if self.is_raw or param.is_raw:
-            return self.settable == param.settable
-        try:
-            bits = self.bits_as(param.type)
-        except UsageError:
-            return False
-        return same_bits(param.type, bits, param.bits)
 
     def __str__(self) -> str:
         kind = 0 if self.is_raw else ParamType.REAL32 if self.type is None else self.type

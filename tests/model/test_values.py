@@ -94,7 +94,6 @@ def test_a_plain_param_of_the_type_custom_is_raw() -> None:
     assert (param.settable, str(param)) == (b"abc\n", "X = 0x0a636261")
     written = WrittenParam.of(param.with_trust(Trust.CACHED))
     assert (written.type, written.is_raw, written.settable) == (11, True, b"abc\n")
-    assert written.is_held_by(param)
 
 
 # Byte-wise
