@@ -12,14 +12,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from paramclient import (
-    Component,
-    ParamClient,
-    ParamClientError,
-    ParamSet,
-    UsageError,
-    read_file,
-)
+from paramclient import Component, ParamClient, ParamClientError, ParamSet, UsageError, read_file
 from paramclient.provision import apply, for_each, plan, restore
 
 FILE = Path(__file__).parent / "parameters/ardupilot/copter.param"

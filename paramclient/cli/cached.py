@@ -15,16 +15,7 @@ from typing import Final
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache, SnapshotSummary
 from paramclient.cli.json_output import history_json, known_members, snapshot_json, taken
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import (
-    ExitCode,
-    code_of,
-    local_time,
-    print_json,
-    print_line,
-    report,
-    say,
-    show,
-)
+from paramclient.cli.output import ExitCode, code_of, local_time, print_json, print_line, report, say, show
 from paramclient.cli.session import check_given
 from paramclient.errors import FileError, LinkError, ParamClientError, UsageError
 from paramclient.files.conversion import kind_of

@@ -11,13 +11,7 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient.cli.json_output import taken
-from paramclient.cli.metadata import (
-    METADATA_HINT,
-    MetadataFile,
-    defaults_in,
-    known_of_sets,
-    say_sources,
-)
+from paramclient.cli.metadata import METADATA_HINT, MetadataFile, defaults_in, known_of_sets, say_sources
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import ExitCode, print_json, report, say
 from paramclient.cli.session import ChosenVehicle, sessions

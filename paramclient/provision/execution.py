@@ -38,15 +38,7 @@ from paramclient.provision.inspection import (
     reread,
     wait_for_identity,
 )
-from paramclient.provision.planning import (
-    WRONG,
-    ApplyRow,
-    ApplyStatus,
-    Plan,
-    PlanOptions,
-    Rows,
-    Stage,
-)
+from paramclient.provision.planning import WRONG, ApplyRow, ApplyStatus, Plan, PlanOptions, Rows, Stage
 
 BEFORE_APPLY: Final = "before apply"
 """The reason of the snapshot that `apply` stores before its first write."""

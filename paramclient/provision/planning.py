@@ -19,13 +19,7 @@ from paramclient.model.comparison import same_value
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
 from paramclient.model.names import nearest_names
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import (
-    Encoding,
-    Param,
-    ParamType,
-    Value,
-    format_value,
-)
+from paramclient.model.values import Encoding, Param, ParamType, Value, format_value
 from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.provision.apply_rules import ACTION, CATEGORIES, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
 

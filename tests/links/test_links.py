@@ -22,16 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from paramclient.errors import LinkError, UsageError
-from paramclient.links import (
-    FORMS,
-    Link,
-    Peer,
-    SimLink,
-    create_link,
-    link,
-    parse_link,
-    sockets,
-)
+from paramclient.links import FORMS, Link, Peer, SimLink, create_link, link, parse_link, sockets
 from paramclient.sim import PX4Vehicle
 from paramclient.wire import messages
 from tests.cable import Cable
