@@ -323,6 +323,7 @@ class _Job:
         is_restore: whether the values are an earlier state of the vehicle.
         plan: the plan, until the writes begin.
         arrived: the outcomes so far.
+        began: when the writes began, as a time of the event loop.
         result: the result at the end.
     """
 
@@ -334,6 +335,7 @@ class _Job:
     is_restore: bool
     plan: Plan | None = None
     arrived: dict[str, ApplyRow] = field(default_factory=dict)
+    began: float = 0.0
     result: ApplyResult | None = None
 
     async def make_plan(self) -> Self:
@@ -352,18 +354,16 @@ class _Job:
     async def write(self) -> Self:
         """Write, and return the job with its result."""
         session = self.session
-        began: float | None = None
 
         def update(now: ApplyProgress) -> None:
-            nonlocal began
             if now.row is not None:
                 self.arrived[now.row.name] = now.row
-                began = began or anyio.current_time()
-                status.update(Progress.after(now.done, now.total, anyio.current_time() - began))
+                status.update(Progress.after(now.done, now.total, anyio.current_time() - self.began))
 
         async def announce() -> None:
             await session.check_only()
             session.announce_write()
+            self.began = anyio.current_time()
 
         self.plan = None
         title = f"{'restoring' if self.is_restore else 'setting'} {session.label}"
