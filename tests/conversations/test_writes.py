@@ -92,22 +92,6 @@ async def test_a_value_is_its_shortest_decimal_and_a_truncated_one_adjusted(
         assert session.table.params[name].index == before.index  # ArduPilot's acknowledgement has 65535
 
 
-async def test_ardupilots_acknowledgement_of_a_default_in_another_type_keeps_the_type() -> None:
-    vehicle = ArduPilotVehicle()
-    async with talking(vehicle) as (_, session):
-        await fetch_all(session)
-        defaults = [
-            param
-            for name, param in session.table.params.items()
-            if param.type is ParamType.INT8 and param.default == param.value and "ENABLE" not in name
-        ]
-        for param in defaults[20:24]:
-            assert isinstance(param.value, int)
-            result = await write(session, param.name, param.value)
-            assert (result.status, result.param.type) == ("accepted", ParamType.INT8)
-            assert result.attempts == 1
-
-
 async def test_px4_clamps_a_value_later_which_a_watched_write_reports() -> None:
     vehicle = PX4Vehicle()
     async with talking(vehicle) as (_, session):
