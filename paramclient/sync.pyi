@@ -43,56 +43,72 @@ __all__ = [
 ]
 
 class Component:
-    "One component of a vehicle; see `ParamClient.component`."
+    """One component of a vehicle; see `ParamClient.component`."""
 
     system: int
     component: int
     is_extended: bool
     params: ParamMap
+
     @property
     def ext(self) -> Component:
         """The extended parameters of the component (PARAM_EXT_*), whose values are also text and bytes."""
+
     @property
     def autopilot(self) -> str:
         """Autopilot of its heartbeat: px4, ardupilot, generic, …; "unknown" before the first heartbeat."""
+
     @property
     def identity(self) -> Identity:
         """Identity of the vehicle from AUTOPILOT_VERSION: hardware id, firmware, capabilities, if known."""
+
     @property
     def encoding(self) -> Encoding:
         """Encoding of its parameter values in messages: bytewise or C cast."""
+
     @property
     def encoding_reason(self) -> str:
         """The reason for `encoding`, as text."""
+
     @property
     def count(self) -> int | None:
         """The `param_count` of the component; None before its first value."""
+
     @property
     def hash(self) -> int | None:
         """PX4's hash or ArduPilot's checksum of the complete table; None if it is not known."""
+
     @property
     def state(self) -> ComponentState:
         """State of the table."""
+
     @property
     def sync_state(self) -> SyncState:
         """Whether the table matches the vehicle, and the running check or update."""
+
     @property
     def address(self) -> Address:
         """Its key in `ParamClient.components`: (system, component), with `split_peers` also the peer."""
+
     @property
     def peer(self) -> str:
         """Address and port from which its messages arrive, and to which requests go."""
+
     @property
     def is_armed(self) -> bool | None:
         """Whether the vehicle is armed, from `base_mode` of its last heartbeat."""
+
     @property
     def silence(self) -> float:
         """Seconds since its last message. After 5 s the component is lost, see `Event`."""
+
     @property
     def round_trip(self) -> float | None:
         """Smoothed round-trip time in seconds; None before the first response."""
+
     def get(self, name: str | int, *, timeout: float | None = None) -> Param:
         """Read one parameter from the vehicle."""
+
     def set(
         self,
         name: str,
@@ -105,6 +121,7 @@ class Component:
         author: str | None = None,
     ) -> SetResult:
         """Write one parameter, and verify the value that the vehicle acknowledges."""
+
     def set_many(
         self,
         values: Mapping[str, Settable] | Iterable[tuple[str, Settable]],
@@ -117,6 +134,7 @@ class Component:
         author: str | None = None,
     ) -> SetManyResult:
         """Write many parameters in one call, and verify each as `set` does."""
+
     def fetch_all(
         self,
         *,
@@ -125,10 +143,13 @@ class Component:
         progress: Callable[[Progress], None] | None = None,
     ) -> FetchResult:
         """Fetch all parameters. Uses the cache if the vehicle confirms it, otherwise downloads."""
+
     def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
         """Give the vehicle a signing key with SETUP_SIGNING, or with None, disable its signing."""
+
     def reboot(self, *, system: int | None = None, timeout: float | None = REBOOT_TIMEOUT) -> Component:
         """Reboot the vehicle, and wait until it is back and identified. Written values are saved before."""
+
     def read_file(
         self,
         path: str,
@@ -138,21 +159,24 @@ class Component:
         timeout: float | None = None,
     ) -> bytes:
         """Read a file over MAVFTP. Its session on board is closed, also on cancellation."""
+
     def file_checksum(self, path: str, *, timeout: float | None = None) -> int:
         """Return the CRC-32 of a file, computed by the component; see `crc32_px4`."""
+
     def changes(self) -> Changes:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`."""
 
 Wanted: TypeAlias = ParamSet | Mapping[str, Settable]
 
 class Changes(Iterator[Change]):
-    "Stream of the changes since its creation; see `Component.changes`."
+    """Stream of the changes since its creation; see `Component.changes`."""
+
     def __next__(self) -> Change: ...
     def next(self, timeout: float | None = None) -> Change: ...
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    "What has happened to a component."
+    """What has happened to a component."""
 
     component: Component
     kind: Literal["discovered", "lost", "found", "rebooted", "resynced"]
@@ -161,16 +185,18 @@ class Event:
     hash: int | None = None
 
 class Events(Iterator[Event]):
-    "Stream of the component events since its creation; see `ParamClient.events`."
+    """Stream of the component events since its creation; see `ParamClient.events`."""
+
     def __next__(self) -> Event: ...
     def next(self, timeout: float | None = None) -> Event: ...
 
 class ParamClient:
-    "A ground station for the MAVLink parameter protocol on one link, as an async context manager."
+    """A ground station for the MAVLink parameter protocol on one link, as an async context manager."""
 
     link: Link
     cache: ParamCache | None
     listens_only: bool
+
     def __enter__(self) -> Self: ...
     def __exit__(self, *error: object) -> None: ...
     def open(self) -> Self: ...
@@ -194,17 +220,22 @@ class ParamClient:
     @property
     def components(self) -> Mapping[Address, Component]:
         """All components from which messages have arrived, by (system, component). Read-only and live."""
+
     @property
     def autopilots(self) -> list[Component]:
         """The autopilot of each system, sorted by system id, without cameras, gimbals and the like."""
+
     @property
     def bytes_received(self) -> int:
         """Bytes received over the link."""
+
     @property
     def bytes_sent(self) -> int:
         """Bytes of all sent frames, including heartbeats."""
+
     def events(self) -> Events:
         """Return a stream of component events from now on: `async for event in client.events()`."""
+
     def component(
         self,
         system: int | None = None,
@@ -214,10 +245,12 @@ class ParamClient:
         timeout: float | None = COMPONENT_TIMEOUT,
     ) -> Component:
         """Return the component with this address, after its first message."""
+
     def find_autopilots(
         self, *, expect: int | None = None, timeout: float | None = COMPONENT_TIMEOUT
     ) -> list[Component]:
         """Return the autopilot of every vehicle on the link, sorted by system id; for programs for fleets."""
+
     def only_component(
         self,
         system: int | None = None,
@@ -227,16 +260,20 @@ class ParamClient:
         timeout: float | None = COMPONENT_TIMEOUT,
     ) -> Component:
         """Return the component with this address if the choice is unambiguous; for programs that write."""
+
     def successor(
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
     ) -> Component:
         """Return the component of the same vehicle under its new system id, after its first message there."""
+
     def fetch_all(
         self, system: int | None = None, *, refresh: bool = False, timeout: float | None = None
     ) -> FetchedAll:
         """Update the tables of all components of one system, or of every system on the link."""
+
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss."""
+
     def signing_report(self) -> SigningReport | None:
         """Return the signing statistics of the link: signed frames, and refused frames with the reasons."""
 
