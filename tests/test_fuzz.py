@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
@@ -70,9 +69,3 @@ def test_every_target_is_tested_and_its_corpus_is_small() -> None:
     assert rooms == set(TARGETS)
     assert {path.name for path in (FUZZ / "corpus").iterdir()} == set(TARGETS)
     assert sum(path.stat().st_size for path in FUZZ.rglob("*") if path.is_file()) < LARGEST_CORPUS
-
-
-def test_the_fuzzer_is_no_dependency_of_the_tests() -> None:
-    groups = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["dependency-groups"]
-    assert any(each.startswith("atheris") for each in groups["fuzz"])
-    assert not any(each.startswith("atheris") for each in groups["test"])

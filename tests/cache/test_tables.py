@@ -45,13 +45,6 @@ def hashed_table(*bits: int, at: float = NOW) -> TableUpdate:
 # what is stored
 
 
-def test_an_empty_cache_has_nothing(cache: ParamCache) -> None:
-    assert cache.vehicles() == []
-    assert cache.components() == []
-    assert cache.load(PX4.key, 1) is None
-    assert cache.load(PX4.key, 1, extended=True) is None
-
-
 def test_a_table_is_read_as_it_was_written(cache: ParamCache, open_cache: Open) -> None:
     kinds = {
         "NAN": (ParamType.REAL32, 0x7FC00001),

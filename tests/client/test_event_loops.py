@@ -19,7 +19,6 @@ import anyio.lowlevel
 import pytest
 
 from paramclient import ClientClosed, Component, ParamClient, Progress, UsageError
-from paramclient.client import client as client_module
 from paramclient.client import core, link_task
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer, SimLink, create_link, serve_endpoint
@@ -95,15 +94,6 @@ async def test_a_link_that_cannot_be_opened(link: str) -> None:
         async with a_client(f"{link}:127.0.0.1:{port}"):
             pass
     await taken.close()
-
-
-async def test_several_vehicles_are_fetched_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client_module, "LISTENING_TIME", 0.1)
-    vehicles = [generic(system=system, **QUICK) for system in (1, 2, 3)]
-    async with beside(), a_client(Air(vehicles)) as client:
-        fetched = await client.fetch_all()
-        assert set(fetched.results) == {(1, 1), (2, 1), (3, 1)}
-        assert fetched.complete
 
 
 @pytest.mark.parametrize("how", ["error", "scope"])

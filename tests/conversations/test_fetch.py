@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import struct
-from collections import Counter
 from dataclasses import replace
 
 import anyio
 import pytest
 
-from paramclient.errors import NoReply, ParamErrorCode
+from paramclient.errors import ParamErrorCode
 from paramclient.model.values import ParamType, Trust
-from paramclient.protocol.fetch import FetchResult, Policy, Progress, fetch_all
+from paramclient.protocol.fetch import FetchResult, Progress, fetch_all
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle, px4_table
 from paramclient.wire import messages
 from tests.conversations.virtual import Silence, Tap, converse, meanwhile, run, talking, virtual_on_both
@@ -74,33 +73,6 @@ async def test_every_value_arrives_over_a_satellite(kind: str, loss: float) -> N
             assert not result.missing
             assert result.elapsed < 60
             assert (session.channel.timing.round_trip or 0.0) >= 2.4
-
-
-@virtual_on_both
-async def test_the_hash_confirms_a_table_without_a_download() -> None:
-    vehicle = PX4Vehicle()
-    async with talking(Air.symmetric([vehicle], delay=0.05)) as (conversation, session):
-        first = await fetch_all(session)
-        assert first.hash == session.table.hash is not None
-        session.table.doubt()
-        sent, lists = len(conversation.sent), vehicle.requests["PARAM_REQUEST_LIST"]
-        second = await fetch_all(session)
-        assert (second.source, second.hash) == ("cache", first.hash)
-        assert vehicle.requests["PARAM_REQUEST_LIST"] == lists
-        assert len(conversation.sent) - sent < 80  # the hash, and the values outside it
-        trusts = Counter(param.trust for param in second.params.values())
-        assert trusts[Trust.VERIFIED] == len(second.params) - trusts[Trust.LIVE]
-        assert trusts[Trust.LIVE] == len(session.table.volatile)
-
-
-async def test_a_value_changed_meanwhile_is_downloaded() -> None:
-    vehicle = PX4Vehicle()
-    async with talking(vehicle) as (_, session):
-        await fetch_all(session)
-        vehicle.load({"MC_ROLL_P": 3.0})
-        result = await fetch_all(session)
-        assert result.source == "stream"
-        assert result.params["MC_ROLL_P"].value == 3.0
 
 
 @virtual_on_both
@@ -205,15 +177,6 @@ async def test_a_first_fetch_waits_for_the_identity_but_not_for_long(known_at: f
         assert result.source == source
 
 
-async def test_a_vehicle_that_never_answers_is_no_reply() -> None:
-    endpoint = Silence(PX4Vehicle(), at=1e9)
-    async with talking(endpoint) as (_, session):
-        endpoint.at = anyio.current_time()
-        with pytest.raises(NoReply):
-            await fetch_all(session)
-        assert anyio.current_time() - endpoint.at < 7.0
-
-
 async def test_dead_indices_are_missing() -> None:
     async with talking(PX4Vehicle(dead=[3, 77])) as (_, session):
         result = await fetch_all(session)
@@ -289,19 +252,6 @@ async def test_a_value_outside_the_hash_that_is_not_received_is_missing() -> Non
         assert any(secret.name in note for note in result.notes)
 
 
-async def test_policies_limit_what_is_sent() -> None:
-    vehicle = PX4Vehicle()
-    async with talking(vehicle) as (_, session):
-        await fetch_all(session)
-        vehicle.load({"MC_ROLL_P": 3.0})
-        before = Counter(vehicle.requests)
-        cached = await fetch_all(session, policy=Policy.CACHE_ONLY)
-        assert Counter(vehicle.requests) - before == Counter()
-        assert cached.params["MC_ROLL_P"].value != 3.0
-        asked = await fetch_all(session, policy=Policy.HASH_ONLY)
-        assert (asked.source, vehicle.requests["PARAM_REQUEST_LIST"]) == ("cache", 1)
-
-
 async def test_progress_rises_to_the_count() -> None:
     async with converse(PX4Vehicle()) as conversation:
         seen: list[Progress] = []
@@ -309,17 +259,3 @@ async def test_progress_rises_to_the_count() -> None:
         received = [each.received for each in seen]
         assert received == sorted(received)
         assert (seen[-1].received, seen[-1].total) == (result.count, result.count)
-
-
-async def test_a_group_that_appears_changes_the_count_and_all_is_fetched() -> None:
-    vehicle = ArduPilotVehicle()
-    async with talking(vehicle) as (_, session):
-        first = await fetch_all(session)
-        vehicle.set_param("EK2_ENABLE", 1)
-        second = await fetch_all(session)
-        assert second.count > first.count
-        check_right(vehicle, second)
-        vehicle.set_param("EK2_ENABLE", 0)
-        third = await fetch_all(session)
-        assert third.count == first.count
-        assert set(third.params) == set(first.params)

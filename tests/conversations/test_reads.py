@@ -186,16 +186,3 @@ async def test_equal_reads_are_one_request_and_a_cancelled_one_ends_alone(make: 
         assert vehicle.requests["PARAM_REQUEST_READ"] - before == 1
         await read(session, name)
         assert vehicle.requests["PARAM_REQUEST_READ"] - before == 2
-
-
-@virtual_on_both
-async def test_a_cancelled_read_leaves_nothing_behind() -> None:
-    async with talking(PX4Vehicle()) as (conversation, session):
-        await session.identification.settled()
-        with anyio.move_on_after(0.3):
-            await read(session, "NO_SUCH")
-        assert not session.channel.inboxes
-        conversation.sent.clear()
-        await anyio.sleep(5.0)
-        assert not conversation.sent_of(ParamRequestRead)
-        await read_many(session, ["MC_ROLL_P"] * 200)

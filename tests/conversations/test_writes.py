@@ -27,7 +27,6 @@ from paramclient.wire.messages import (
     ParamError,
     ParamSet,
     ParamValue,
-    encode,
 )
 from tests.conversations.partial import Partial
 from tests.conversations.virtual import Silence, Tap, converse, losing, meanwhile, talking, virtual_on_both
@@ -261,17 +260,6 @@ async def test_silence_is_no_reply_within_7_s_and_a_cancelled_write_sends_no_mor
             assert not session.writing
 
 
-async def test_writes_to_one_name_follow_each_other() -> None:
-    vehicle = PX4Vehicle()
-    async with talking(Air.symmetric([vehicle], delay=0.05)) as (conversation, session):
-        async with anyio.create_task_group() as tasks:
-            for value in (1.0, 2.0, 3.0):
-                tasks.start_soon(write, session, "MC_ROLL_P", value)
-                await anyio.sleep(0.001)
-        assert vehicle.param("MC_ROLL_P").value == 3.0
-        assert [each.new.value for each in conversation.changes if each.new][-3:] == [1.0, 2.0, 3.0]
-
-
 async def test_values_of_one_parameter_are_set_in_the_order_of_the_call() -> None:
     vehicle = ArduPilotVehicle()
     names = ["RTL_ALT", "rtl_alt"]
@@ -399,27 +387,6 @@ async def test_another_vehicle_behind_a_value_ends_a_write_and_no_read() -> None
                 conversation.hear(AutopilotVersion(16, uid=uid))
             assert [type(each).__name__ for each in outcomes] == [ends_with]
         assert not vehicle.number_of(ParamSet)
-
-
-# authors
-
-
-async def test_a_change_has_the_author_whose_set_was_seen() -> None:
-    vehicle = PX4Vehicle()
-    async with talking(vehicle) as (conversation, session):
-        await read(session, "MC_ROLL_P")
-        theirs = ParamSet(1, 1, "MC_ROLL_P", struct.pack("<f", 3.0), ParamType.REAL32)
-        conversation.hear(theirs, system=254, component=190)
-        data = encode(theirs, system=254, component=190, sequence=0)
-        vehicle.receive(data, anyio.current_time())
-        await anyio.sleep(3.0)
-        await write(session, "MC_ROLL_P", 5.0)
-        await write(session, "MC_ROLL_P", 6.0, author="us for pilot")
-        await anyio.sleep(5.0)
-        vehicle.set_param("MC_ROLL_P", 7.0)
-        await anyio.sleep(1.0)
-        changes = [(each.new.value, each.by) for each in conversation.changes if each.old and each.new]
-        assert changes == [(3.0, "station 254/190"), (5.0, "us"), (6.0, "us for pilot"), (7.0, "vehicle")]
 
 
 # several
