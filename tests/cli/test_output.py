@@ -97,7 +97,7 @@ def test_times_are_local_with_their_zone_and_can_be_parsed_back(command: Command
 # closed outputs
 
 
-@pytest.mark.parametrize("words", [["-h"], ["cache", "--help"], []])
+@pytest.mark.parametrize("words", [["-h"], []])
 def test_help_whose_reader_closes_it_is_no_error(words: list[str]) -> None:
     program = f"import sys; from paramclient.__main__ import main; sys.argv[1:] = {words}; main()"
     with subprocess.Popen(
@@ -117,9 +117,7 @@ def test_help_whose_reader_closes_it_is_no_error(words: list[str]) -> None:
     ("content", "kind"),
     [
         (b"", "neither a telemetry log"),
-        (b"MC_ROLL_P,4.5\nMC_YAW_P,2\n", "neither a telemetry log"),
         (b"SQLite format 3\0" + bytes(100), "an SQLite database"),
-        (bytes(range(256)), "neither a telemetry log"),
         (None, "No such file or directory"),
     ],
 )

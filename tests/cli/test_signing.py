@@ -70,13 +70,10 @@ def test_commands_sign_with_the_key_of_a_file_or_the_environment(
 
 def test_link_reports_signatures(put: Put, key_file: Path, command: Command) -> None:
     signed = small_px4(signing_key=KEY, signing_timestamp=timestamp_now())
-    for vehicle, text in (
-        (signed, rf"key {KEY.fingerprint}: [1-9]\d* frames proven"),
-        (small_px4(), r": 0 frames proven, [1-9]\d* refused: unsigned\n"),
-    ):
-        shown = command("link", put(vehicle), "--seconds", 0.3, "--signing-key", key_file)
-        assert shown.code == 0
-        assert re.search(text, shown.out)
+    shown = command("link", put(signed), "--seconds", 0.3, "--signing-key", key_file)
+    assert re.search(rf"key {KEY.fingerprint}: [1-9]\d* frames proven", shown.out)
+    shown = command("link", put(small_px4()), "--seconds", 0.3, "--signing-key", key_file)
+    assert re.search(r": 0 frames proven, [1-9]\d* refused: unsigned\n", shown.out)
 
 
 def test_a_key_is_set_changed_and_removed_each_with_its_proof(
