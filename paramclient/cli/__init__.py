@@ -1,7 +1,7 @@
 """The command line: parses arguments, calls the client, and prints tables or JSON.
 
 - `app`: all subcommands, the main function, signals and errors.
-- Subcommands: `read_commands` (fetch, get, watch), `set_command` with `writes`, `reset_command`, `apply`
+- Subcommands: `read_commands` (fetch, get, watch), `set_command` (set, reset) with `writes`, `apply`
   (apply, restore), `show` (show, search, info), `cached` (cache, import, history), `save`, `diff`,
   `metadata`, `link` (link, ports), `check`, `signing` and `serve` (serve, token, sim).
 - `session`: open links with the vehicles of --vehicle, on which a subcommand works, and the parameters that

@@ -13,7 +13,6 @@ import anyio
 from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import (
-    ExitCode,
     clear_screen,
     milliseconds,
     print_json,
@@ -53,7 +52,7 @@ async def link(
     seconds: Seconds = None,
     listen_only: bool = False,
     options: TrafficOptions = _DEFAULTS,
-) -> int:
+) -> None:
     """Print the components on a link, their message rates and the packet loss.
 
     On a terminal the table is live until Ctrl-C. Otherwise, and with --json, it is printed once, after
@@ -86,7 +85,6 @@ async def link(
         print_json(found)
     elif not is_live:
         _print(found)
-    return ExitCode.DONE
 
 
 async def _measure_round_trips(client: ParamClient) -> None:
@@ -215,7 +213,7 @@ def _lines(found: JsonObject) -> Iterator[str]:
 # ports
 
 
-def ports(*, json: bool = False) -> ExitCode:
+def ports(*, json: bool = False) -> None:
     """List the serial ports of this computer, autopilots first.
 
     Needs the extra `serial`: pip install 'paramclient[serial]'.
@@ -241,4 +239,3 @@ def ports(*, json: bool = False) -> ExitCode:
         json=json,
         empty="this computer has no serial ports",
     )
-    return ExitCode.DONE

@@ -16,7 +16,7 @@ from cyclopts import Parameter, Token
 from paramclient.cache import ParamCache
 from paramclient.cli.json_output import JsonObject
 from paramclient.cli.options import CacheOptions, LinkOptions
-from paramclient.cli.output import ExitCode, Status, print_json, say, show
+from paramclient.cli.output import Status, print_result, say, show
 from paramclient.cli.session import CommandSession, wait_for_firmware
 from paramclient.errors import UsageError
 from paramclient.metadata import (
@@ -197,7 +197,7 @@ def metadata_add(
     vehicle: VehicleKind | None = None,
     firmware: str | None = None,
     options: CacheOptions = _DEFAULTS,
-) -> ExitCode:
+) -> None:
     """Store a metadata file for a vehicle type and a firmware version, for all commands and the service.
 
     ArduPilot's vehicles do not provide their metadata; its files are at autotest.ardupilot.org/Parameters. A
@@ -210,14 +210,11 @@ def metadata_add(
             Default: for every version for which no other file was added.
     """
     added, metadata = _files(options).add(file, vehicle, firmware)
-    if options.json:
-        print_json(_added_json(added, len(metadata)))
-    else:
-        say(f"{counted(len(metadata), 'description')} from {file} for {added}")
-    return ExitCode.DONE
+    words = f"{counted(len(metadata), 'description')} from {file} for {added}"
+    print_result(_added_json(added, len(metadata)), words, json=options.json)
 
 
-def metadata_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
+def metadata_list(*, options: CacheOptions = _DEFAULTS) -> None:
     """Print the metadata files that were added."""
     counts = [(each, len(read_metadata(each.path))) for each in _files(options)]
     show(
@@ -227,12 +224,11 @@ def metadata_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
         json=options.json,
         empty="no metadata was added",
     )
-    return ExitCode.DONE
 
 
 def metadata_remove(
     vehicle: VehicleKind, /, *, firmware: str | None = None, options: CacheOptions = _DEFAULTS
-) -> ExitCode:
+) -> None:
     """Remove a metadata file that was added.
 
     Args:
@@ -240,11 +236,8 @@ def metadata_remove(
         firmware: The firmware version for which the file was added. Default: the file for every version.
     """
     removed = _files(options).remove(vehicle, firmware)
-    if options.json:
-        print_json({"vehicle": removed.kind, "firmware": removed.firmware})
-    else:
-        say(f"the metadata for {removed} was removed")
-    return ExitCode.DONE
+    found = {"vehicle": removed.kind, "firmware": removed.firmware}
+    print_result(found, f"the metadata for {removed} was removed", json=options.json)
 
 
 def _added_json(added: AddedMetadata, count: int) -> JsonObject:

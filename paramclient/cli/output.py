@@ -167,6 +167,14 @@ def show(
         say(empty)
 
 
+def print_result(item: object, words: str, *, json: bool) -> None:
+    """Print an object as JSON, or the result in words."""
+    if json:
+        print_json(item)
+    else:
+        print_line(words)
+
+
 def cells_of(objects: Mapping[str, Mapping[str, object]], *members: str) -> Iterator[list[object]]:
     """Yield the row of each object of JSON: its name, and these members."""
     return ([name, *map(each.get, members)] for name, each in objects.items())

@@ -11,7 +11,7 @@ import anyio
 
 from paramclient.cli.app import on_end_signal
 from paramclient.cli.options import KeyOptions, Verbose
-from paramclient.cli.output import ExitCode, print_line, say
+from paramclient.cli.output import print_line, say
 from paramclient.client.signing import read_key, timestamp_now
 from paramclient.errors import UsageError
 from paramclient.links import LinkKind, create_link, parse_link, serve_endpoint
@@ -34,7 +34,7 @@ async def serve(
     tokens: Path | None = None,
     verbose: Verbose = False,
     options: KeyOptions = _UNSIGNED,
-) -> int:
+) -> None:
     """Open links and the cache, and share them with ground stations, programs and browsers.
 
     Ground stations connect to the endpoints of `--mavlink` as to a vehicle. All frames pass, and requests
@@ -88,7 +88,6 @@ async def serve(
             stop=stop,
             listens=started,
         )
-    return ExitCode.DONE
 
 
 def token(name: str, /, *, file: Path, read: bool = False) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 
 from paramclient.cli.options import CONNECTION, KeyOptions, Seconds, Verbose
-from paramclient.cli.output import ExitCode, can_ask, confirm, print_json, print_line
+from paramclient.cli.output import can_ask, confirm, print_result
 from paramclient.cli.session import ChosenVehicle, Deadline, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
@@ -47,7 +47,7 @@ class SigningTarget(KeyOptions):
 _DEFAULTS: Final = SigningTarget()
 
 
-async def setup(url: str, /, *, present_key: Path | None = None, options: SigningTarget = _DEFAULTS) -> int:
+async def setup(url: str, /, *, present_key: Path | None = None, options: SigningTarget = _DEFAULTS) -> None:
     """Set the signing key of a vehicle, and verify that the vehicle signs with it.
 
     The key is taken from --signing-key or the environment. It is sent unencrypted: use a link that no other
@@ -62,10 +62,10 @@ async def setup(url: str, /, *, present_key: Path | None = None, options: Signin
     if key is None:
         raise UsageError("no key is given; name one with --signing-key FILE, or set one in the environment")
     present = None if present_key is None else read_key(present_key)
-    return await _change(url, options, key, present, f"The key will be sent over {url} in clear text.")
+    await _change(url, options, key, present, f"The key will be sent over {url} in clear text.")
 
 
-async def disable(url: str, /, *, options: SigningTarget = _DEFAULTS) -> int:
+async def disable(url: str, /, *, options: SigningTarget = _DEFAULTS) -> None:
     """Remove the signing key of a vehicle, and verify that it neither signs nor requires signed frames.
 
     The current key (--signing-key or the environment) is needed if the vehicle requires signed frames: PX4
@@ -75,12 +75,12 @@ async def disable(url: str, /, *, options: SigningTarget = _DEFAULTS) -> int:
         url: The link.
     """
     consequence = f"The vehicle on {url} will then accept commands from any sender."
-    return await _change(url, options, None, options.key, consequence)
+    await _change(url, options, None, options.key, consequence)
 
 
 async def _change(
     url: str, options: SigningTarget, key: SigningKey | None, present: SigningKey | None, consequence: str
-) -> int:
+) -> None:
     """Send SETUP_SIGNING with a key or with none, signed with the present one if known, and verify it."""
     choice = ChosenVehicle.parse(options.vehicle, one="a signing key is set on one vehicle at a time")
     if not options.link_is_safe:
@@ -106,12 +106,10 @@ async def _change(
         elif report is None or address not in {(each.system, each.component) for each in report.streams}:
             raise _refused(address, "answers, but does not sign with the key: it has not accepted the key")
     name = {"system": vehicle.system, "component": vehicle.component, "autopilot": vehicle.autopilot}
-    if options.json:
-        print_json(name | {"signs": key is not None, "fingerprint": key and key.fingerprint})
-    else:
-        state = "no longer signs" if key is None else f"signs with the key {key.fingerprint} now"
-        print_line(f"{vehicle.system}/{vehicle.component} {vehicle.autopilot} {state}")
-    return ExitCode.DONE
+    found = name | {"signs": key is not None, "fingerprint": key and key.fingerprint}
+    state = "no longer signs" if key is None else f"signs with the key {key.fingerprint} now"
+    words = f"{vehicle.system}/{vehicle.component} {vehicle.autopilot} {state}"
+    print_result(found, words, json=options.json)
 
 
 def _client(link: Link, options: SigningTarget, key: SigningKey | None) -> ParamClient:
