@@ -14,7 +14,7 @@ import anyio
 import anyio.to_thread
 
 from paramclient.cli.cached import parse_when
-from paramclient.cli.json_output import JsonObject, apply_json, plan_json, rows_json
+from paramclient.cli.json_output import JsonObject, apply_json, plan_json, row_json, rows_json
 from paramclient.cli.metadata import MetadataChoice, known_of_session
 from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import (
@@ -35,9 +35,7 @@ from paramclient.cli.writes import STYLES, write_all
 from paramclient.errors import CacheError, FileError, NoReply, NotInCache, UnknownVehicle, UsageError
 from paramclient.files import FileFormat, ParamFile
 from paramclient.model.names import age_in_words, first_of
-from paramclient.model.notation import typed
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import format_value
 from paramclient.protocol.fetch import Progress
 from paramclient.provision import (
     CATEGORIES,
@@ -489,9 +487,7 @@ class _Job:
         return f"to continue: `{again}`" if again else "run it again to continue"
 
 
-def _cells(row: ApplyRow, reason: str) -> list[object]:
-    values = (
-        None if value is None else format_value(*typed(value, row.type))
-        for value in (row.before, row.wanted.settable, row.actual)
-    )
-    return [row.name, *values, Coloured(row.status, STYLES[row.status]), reason]
+def _cells(row: ApplyRow, reason: str) -> Sequence[object]:
+    found = row_json(row)
+    values = map(found.get, ("before", "wanted", "actual"))
+    return row.name, *values, Coloured(row.status, STYLES[row.status]), reason

@@ -24,7 +24,6 @@ from paramclient.logs.onboard import is_onboard_log
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import hash_text, time_or_none
-from paramclient.model.values import Param, format_value
 from paramclient.provision.sources import component_of, tables_in
 
 WHEN: Final = (
@@ -93,25 +92,28 @@ def show_summaries(
     json: bool = False,
 ) -> None:
     """Print a line for each table, with the number of extended parameters."""
-    rows, components = [], []
-    for each in summaries:
-        extended, autopilot = sizes.get((each.key, each.component)), autopilot_name(each.autopilot)
-        hash_, synced_at = hash_text(each.hash), each.synced_at
-        components.append(
-            {
-                **taken(each, "key", "system", "component"),
-                "autopilot": autopilot,
-                "uid": each.identity.uid,
-                **taken(each, "size", "count", "complete"),
-                "hash": hash_,
-                "synced_at": time_or_none(synced_at),
-                "updated_at": time_or_none(each.updated_at),
-                **known_members(extended=extended),
-            }
-        )
-        synced = None if synced_at is None else local_time(synced_at)
-        address = f"{each.system}/{each.component}"
-        rows.append([address, autopilot, each.size, extended, hash_, synced, each.key])
+    components = [
+        {
+            **taken(each, "key", "system", "component"),
+            "autopilot": autopilot_name(each.autopilot),
+            "uid": each.identity.uid,
+            **taken(each, "size", "count", "complete"),
+            "hash": hash_text(each.hash),
+            "synced_at": time_or_none(each.synced_at),
+            "updated_at": time_or_none(each.updated_at),
+            **known_members(extended=sizes.get((each.key, each.component))),
+        }
+        for each in summaries
+    ]
+    rows = (
+        [
+            f"{each.system}/{each.component}",
+            *map(found.get, ("autopilot", "size", "extended", "hash")),
+            each.synced_at and local_time(each.synced_at),
+            each.key,
+        ]
+        for each, found in zip(summaries, components, strict=True)
+    )
     columns = ["component", "autopilot", "params", "extended", "hash", "synced", "key"]
     found = {"path": cache.place, "components": components}
     show(found, columns, rows, json=json, empty="no table is in the cache")
@@ -163,18 +165,12 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
             if not tables:
                 report(f"{each} has no parameters")
     if found or options.json:
-        columns = ["file", "component", "autopilot", "params", "complete", "hash", "key"]
-        rows = [
-            {
-                **each,
-                "file": Path(each["file"]).name,
-                "component": f"{each['system']}/{each['component']}",
-                "complete": "yes" if each["complete"] else "no",
-            }
+        members = ("autopilot", "params", "complete", "hash", "key")
+        rows = (
+            [Path(each["file"]).name, f"{each['system']}/{each['component']}", *map(each.get, members)]
             for each in found
-        ]
-        cells = ([row[name] for name in columns] for row in rows)
-        show({"tables": found}, columns, cells, json=options.json)
+        )
+        show({"tables": found}, ["file", "component", *members], rows, json=options.json)
     return code
 
 
@@ -232,29 +228,23 @@ def history(
         if snapshots:
             kept = cache.snapshots(key, component, extended=extended)
             kept = [each for each in kept if begin is None or each.at >= begin]
-        else:
-            entries = cache.history(key, component, extended=extended)
-            known = {each.name for each in entries}
-            known.update(*(each.params for each in load_tables(cache, tables, extended=extended)))
-    if snapshots:
-        show(
-            {"snapshots": [snapshot_json(each) for each in kept]},
-            ["id", "time", "component", "params", "hash", "reason"],
-            map(_snapshot_cells, kept),
-            json=options.json,
-            empty="no snapshots: apply and restore store one before they write",
-        )
-        return ExitCode.DONE
-    chosen = NameChoice(check_given(names)).choose(known, f" of {key} in the cache")
-    entries = [
-        each for each in entries if (each.name in chosen or not names) and (begin is None or each.at >= begin)
-    ]
-    rows = (
-        (local_time(each.at), each.component, each.name, _value(each.old), _value(each.new), each.by)
-        for each in entries
-    )
-    columns = ["time", "component", "name", "old", "new", "by"]
-    show({"history": [history_json(each) for each in entries]}, columns, rows, json=options.json)
+            show(
+                {"snapshots": [snapshot_json(each) for each in kept]},
+                ["id", "time", "component", "params", "hash", "reason"],
+                map(_snapshot_cells, kept),
+                json=options.json,
+                empty="no snapshots: apply and restore store one before they write",
+            )
+            return ExitCode.DONE
+        entries = cache.history(key, component, extended=extended)
+        known = {each.name for each in entries}
+        known.update(*(each.params for each in load_tables(cache, tables, extended=extended)))
+    chosen = NameChoice(check_given(names)).choose(known, f" of {key} in the cache") if names else known
+    entries = [each for each in entries if each.name in chosen and (begin is None or each.at >= begin)]
+    found = [history_json(each) for each in entries]
+    members = ("component", "name", "old", "new", "by")
+    rows = ([local_time(each.at), *map(line.get, members)] for each, line in zip(entries, found, strict=True))
+    show({"history": found}, ["time", *members], rows, json=options.json)
     return ExitCode.DONE
 
 
@@ -264,10 +254,6 @@ def _snapshot_cells(each: SnapshotSummary) -> Sequence[object]:
         notes.append("interrupted, or still running")
     reason = f"{each.reason} ({', '.join(notes)})" if notes else each.reason
     return each.id, local_time(each.at), each.component, each.size, hash_text(each.hash), reason
-
-
-def _value(param: Param | None) -> str | None:
-    return None if param is None else format_value(param.settable, param.type)
 
 
 # Times

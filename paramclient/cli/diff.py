@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from typing import Final
 
-from paramclient.cli.json_output import diff_json
+from paramclient.cli.json_output import JsonObject, diff_json
 from paramclient.cli.metadata import (
     METADATA_HINT,
     MetadataFile,
     defaults_in,
     known_of_sets,
-    meaning_of,
-    units_of,
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, ExitCode, print_json, print_table, say
-from paramclient.cli.sources import described, part_of, resolve_all, value_text
+from paramclient.cli.sources import described, part_of, resolve_all
 from paramclient.errors import UsageError
-from paramclient.metadata import Metadata
-from paramclient.model.comparison import ChangedSide, Comparison, Difference, DifferenceStatus, compare
-from paramclient.model.paramset import WrittenParam
+from paramclient.model.comparison import ChangedSide, Comparison, DifferenceStatus, compare
 from paramclient.provision.sources import collect_defaults, is_file, is_offline
 
 DEFAULTS: Final = "defaults"
@@ -83,82 +79,72 @@ async def diff(
         except UsageError as error:
             raise UsageError(f"{error}; {METADATA_HINT}") from None
         known.append(known[0] or known[1])
-    known = [*known, None][:3]
     outcome = compare(first, second, base=before, names=only or None)
+    found = diff_json(outcome, [*known, None][:3], has_defaults=base == DEFAULTS)
     if options.json:
-        print_json(diff_json(outcome, known, has_defaults=base == DEFAULTS))
-    else:
-        _print(outcome, known)
-        hint = "" if partial else _partial_hint(outcome, left, right)
-        for line in [*_summary(outcome), *filter(None, [hint])]:
-            say(line)
+        print_json(found)
+        return ExitCode.DONE if outcome.is_same else ExitCode.DIFFERENT
+    _print(found)
+    for side, params in (("left", first), ("right", second), ("base", before)):
+        if params is not None:
+            say(f"{side}: {described(params)}")
+    say(_summary(found))
+    if not partial and (hint := _partial_hint(outcome, left, right)):
+        say(hint)
     return ExitCode.DONE if outcome.is_same else ExitCode.DIFFERENT
 
 
 # Tables
 
 
-def _print(outcome: Comparison, known: list[Metadata | None]) -> None:
-    """Print the entries that differ; `known` is the metadata of left, right and base.
-
-    Two versions of a firmware may name a value differently. With a base, values that differ from it are
-    coloured, else values that differ.
-    """
+def _print(found: JsonObject) -> None:
+    """Print the entries that differ. With a base, values that differ from it are coloured, else all."""
     rows = []
-    for entry in outcome.entries:
-        if not entry.is_shown:
-            continue
-        sides = entry.left, entry.right, entry.base
-        left, right, base = (_shown(side, info) for side, info in zip(sides, known, strict=True))
-        style = "bold red" if entry.changed_side is ChangedSide.CONFLICT else _STYLES[entry.status]
-        cells = [
-            text and Coloured(text, "" if entry.changed_side in (other, ChangedSide.NEITHER) else style)
-            for text, other in ((left, ChangedSide.RIGHT), (right, ChangedSide.LEFT))
-        ]
-        units = units_of(known[0], entry.name) or units_of(known[1], entry.name)
-        changed = None if outcome.base is None else entry.changed_side or "unknown"
-        rows.append([entry.name, *cells, base, units, Coloured(_comparison_text(entry), style), changed])
+    for name, entry in found["params"].items():
+        side, words = entry["changed_side"], [entry["is"]]
+        style = "bold red" if side == ChangedSide.CONFLICT else _STYLES[entry["is"]]
+        left, right = (
+            text and Coloured(text, "" if side in (other, ChangedSide.NEITHER) else style)
+            for text, other in (
+                (_shown(entry["left"]), ChangedSide.RIGHT),
+                (_shown(entry["right"]), ChangedSide.LEFT),
+            )
+        )
+        if entry["types_differ"]:
+            words.append(f"{entry['left']['type']} and {entry['right']['type']}")
+        if entry["rounding"]:
+            words.append("the same as float32")
+        is_ = Coloured(", ".join(words), style)
+        changed = None if found["base"] is None else side or "unknown"
+        rows.append([name, left, right, _shown(entry["base"]), entry.get("units"), is_, changed])
     if rows:
-        columns = ["name", "left", "right", "base", "units", "is", "changed"]
-        print_table(columns, rows)
+        print_table(["name", "left", "right", "base", "units", "is", "changed"], rows)
 
 
-def _shown(param: WrittenParam | None, metadata: Metadata | None) -> str | None:
+def _shown(side: JsonObject | None) -> str | None:
     """Return a value with its meaning, if known: `5 (Loiter)`. `info` prints all names of a bit mask."""
-    if param is None:
+    if side is None:
         return None
-    meaning = meaning_of(metadata, param.name, param.settable) or ""
+    meaning = side.get("text", "")
     if len(meaning) > MEANING_LENGTH_MAX:
         meaning = f"{meaning[:MEANING_LENGTH_MAX]}..."
-    return f"{value_text(param)} ({meaning})" if meaning else value_text(param)
+    return f"{side['value']} ({meaning})" if meaning else str(side["value"])
 
 
-def _comparison_text(entry: Difference) -> str:
-    """Return the comparison of an entry in words."""
-    types = [
-        each.type.name for each in (entry.left, entry.right) if each is not None and each.type is not None
-    ]
-    more = [" and ".join(types)] if entry.types_differ else []
-    return ", ".join([entry.status, *more, *["the same as float32"] * entry.is_rounding])
-
-
-def _summary(outcome: Comparison) -> list[str]:
-    """Return the lines that name the compared sets, and the numbers of entries of each kind."""
-    sides = {"left": outcome.left, "right": outcome.right, "base": outcome.base}
-    lines = [f"{side}: {described(params)}" for side, params in sides.items() if params is not None]
-    found = [f"{number} {status}" for status in DifferenceStatus if (number := outcome.counts[status])]
-    if retyped := sum(entry.types_differ for entry in outcome.entries):
-        found.append(f"{retyped} of another type")
-    if outcome.base is not None:
+def _summary(found: JsonObject) -> str:
+    """Return the numbers of entries of each kind."""
+    entries, sides = found["params"].values(), found["changed_sides"]
+    numbers = [(number, kind) for kind, number in found["counts"].items()]
+    numbers.append((sum(entry["types_differ"] for entry in entries), "of another type"))
+    words = [f"{number} {kind}" for number, kind in numbers if number]
+    if sides is not None:
         changed = [
-            f"{number} {side}"
-            for side in ChangedSide
-            if side is not ChangedSide.NEITHER and (number := outcome.changed_sides[side])
+            f"{number} {side}" for side, number in sides.items() if number and side != ChangedSide.NEITHER
         ]
-        found.append(f"changed from the base: {', '.join(changed) or 'none'}")
-        if unknown := sum(entry.changed_side is None for entry in outcome.entries):
-            found.append(f"{unknown} not in the base")
-    return [*lines, "; ".join(found)]
+        words.append(f"changed from the base: {', '.join(changed) or 'none'}")
+        if unknown := sum(found["counts"].values()) - sum(sides.values()):
+            words.append(f"{unknown} not in the base")
+    return "; ".join(words)
 
 
 def _partial_hint(outcome: Comparison, left: str, right: str) -> str:

@@ -268,22 +268,24 @@ def diff_json(
 # Plans and results of apply and restore
 
 
+def row_json(row: ApplyRow) -> JsonObject:
+    """Return what is planned for a parameter, or what became of it."""
+
+    def value(given: Value | None) -> Scalar | None:
+        return None if given is None else value_json(*typed(given, row.type))
+
+    return {
+        "status": row.status,
+        "type": None if row.type is None else ParamType(row.type).name,
+        "before": value(row.before),
+        "wanted": value(row.wanted.settable),
+        "actual": value(row.actual),
+        **taken(row, "category", "reason", "nearest"),
+    }
+
+
 def rows_json(rows: Iterable[ApplyRow]) -> JsonObject:
-    """Return what is planned for parameters, or what became of them, by name in the file."""
-
-    def row_json(row: ApplyRow) -> JsonObject:
-        def value(given: Value | None) -> Scalar | None:
-            return None if given is None else value_json(*typed(given, row.type))
-
-        return {
-            "status": row.status,
-            "type": None if row.type is None else ParamType(row.type).name,
-            "before": value(row.before),
-            "wanted": value(row.wanted.settable),
-            "actual": value(row.actual),
-            **taken(row, "category", "reason", "nearest"),
-        }
-
+    """Return rows by the names in the file."""
     return {row.name: row_json(row) for row in rows}
 
 

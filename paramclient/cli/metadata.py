@@ -31,7 +31,6 @@ from paramclient.metadata import (
 from paramclient.metadata.store import AddedFiles
 from paramclient.model.names import counted
 from paramclient.model.paramset import Default, DefaultSource, ParamSet
-from paramclient.model.values import Value
 from paramclient.protocol.fetch import Progress
 
 VEHICLE: Final = "vehicle"
@@ -170,21 +169,6 @@ def no_defaults() -> str:
     from paramclient.provision.sources import NO_DEFAULTS  # only here: loads provision
 
     return f"{NO_DEFAULTS}; {METADATA_HINT}"
-
-
-# Output
-
-
-def meaning_of(metadata: Metadata | None, name: str, value: Value) -> str | None:
-    """Return the meaning of a value in a word, or None."""
-    info = info_of(metadata, name)
-    return None if info is None else info.text(value) or None
-
-
-def units_of(metadata: Metadata | None, name: str) -> str | None:
-    """Return the units of a parameter, or None."""
-    info = info_of(metadata, name)
-    return None if info is None else info.units or None
 
 
 # Subcommands

@@ -16,8 +16,7 @@ from paramclient.files.formats import ENDINGS, address
 from paramclient.links import FORMS, LinkKind, parse_link
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import counted
-from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, format_value
+from paramclient.model.paramset import ParamSet
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.sources import fetched_set, is_file, is_offline, link_of, resolve
 
@@ -149,11 +148,6 @@ def described(params: ParamSet) -> str:
 def noun_of(params: ParamSet) -> str:
     """Return the parameters of a set in words, in the singular."""
     return "extended parameter" if params.is_extended else "parameter"
-
-
-def value_text(param: WrittenParam) -> str:
-    """Return a parameter's value as text."""
-    return format_value(param.settable, ParamType.REAL32 if param.type is None else param.type)
 
 
 # File names for several vehicles

@@ -11,13 +11,13 @@ from typing import ClassVar, Final, Protocol, Self
 import anyio
 
 from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
-from paramclient.cli.metadata import info_of, meaning_of
+from paramclient.cli.metadata import info_of
 from paramclient.cli.output import LINE_NAMES_MAX, Coloured, ExitCode, Status, code_of, report, say
 from paramclient.cli.session import CommandSession, Done, Sessions, Shown
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.names import counted, first_of
-from paramclient.model.values import ParamType, Value, format_value
+from paramclient.model.values import ParamType, Value
 from paramclient.protocol.fetch import Progress
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 
@@ -149,17 +149,9 @@ class SetJob:
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the rows; the reported value with its meaning, if that is known."""
-        for each in self.outcomes:
-            kind, name = self._type_of(each), each.name
-            requested = kind if isinstance(each.requested, bytes) else ParamType.REAL64
-            actual = None if each.reported is None else format_value(each.reported, kind)
-            meaning = None if each.reported is None else meaning_of(self.described, name, each.reported)
-            yield (
-                name,
-                format_value(each.requested, requested),
-                f"{actual} ({meaning})" if meaning else actual,
-                Coloured(each.status, STYLES[each.status]),
-            )
+        for each in self.as_json()["results"]:
+            actual = each["actual"] if "text" not in each else f"{each['actual']} ({each['text']})"
+            yield each["name"], each["requested"], actual, Coloured(each["status"], STYLES[each["status"]])
 
     def report(self) -> int:
         """Print counts, remarks and errors: one line for all values without a response, and for one cause."""
