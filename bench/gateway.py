@@ -32,7 +32,23 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import anyio
-from peers import (CLIENTS, LIMIT, LOSSES, ROUND_TRIP, SESSION_PAUSE, Case, LiveCase, LiveField, MavProxy, Outcome, PythonClient, choose, free_port, machine, versions)
+from peers import (
+    CLIENTS,
+    LIMIT,
+    LOSSES,
+    ROUND_TRIP,
+    SESSION_PAUSE,
+    Case,
+    LiveCase,
+    LiveField,
+    MavProxy,
+    Outcome,
+    PythonClient,
+    choose,
+    free_port,
+    machine,
+    versions,
+)
 
 from paramclient.links import Link, create_link
 from paramclient.service import Hub

@@ -10,7 +10,15 @@ from typing import Final
 from fuzz.draw import Draw
 from paramclient.errors import UsageError
 from paramclient.wire.frames import Framer, build_frame, sign_frame, unsign_frame
-from paramclient.wire.signing import (ADOPTED_TIMESTAMP_MAX, LAST_TIMESTAMP, Refusal, Signer, SigningKey, SigningPolicy, Verifier)
+from paramclient.wire.signing import (
+    ADOPTED_TIMESTAMP_MAX,
+    LAST_TIMESTAMP,
+    Refusal,
+    Signer,
+    SigningKey,
+    SigningPolicy,
+    Verifier,
+)
 
 __all__ = ["INPUT_SIZE_MAX", "run"]
 

@@ -40,8 +40,6 @@ RECHECK_TIMEOUT: Final = 2.5
 was lost in between."""
 AWAITED_NAMES_MAX: Final = 3
 """Parameters that the line about awaited values names."""
-_CAPITALS: Final = ("px4", "ardupilot")
-"""Autopilots whose parameters all have names in capitals."""
 FIRMWARE_TIMEOUT: Final = 0.5
 """Seconds to wait for the firmware version of the vehicle, to name it to the user or to find its metadata."""
 
@@ -516,6 +514,4 @@ def spelling(name: str, component: Component) -> str:
         return name
     upper = name.upper()
     known = [each for each in component.params if each.upper() == upper]
-    if known:
-        return known[0] if len(known) == 1 else name
-    return upper if component.autopilot in _CAPITALS else name
+    return known[0] if len(known) == 1 else name

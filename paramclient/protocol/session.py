@@ -191,7 +191,8 @@ class Session:
     def receive(self, message: ReportedValue, now: float) -> None:
         """Store a value, unless it may be the answer to a read from before a write."""
         name, spelled = message.param_id, self.spelled(message.param_id)
-        if name != spelled and (message.param_index == NO_INDEX or spelled in self.table.params):
+        is_listed = message.param_index != NO_INDEX and spelled not in self.table.params
+        if name != spelled and self.identification.is_ardupilot and not is_listed:
             name, message = spelled, message._replace(param_id=spelled)
         _, raw, number, _, _ = message
         for each in self.replaced.get(name, ()):
@@ -220,10 +221,11 @@ class Session:
     def spelled(self, name: str) -> str:
         """Return a name as the vehicle spells it.
 
-        An ArduPilot takes any case, and answers a read in the requested one, but a set in capitals. A name
-        that is listed in lower case stays.
+        An ArduPilot takes any case, and answers a read in the requested one, but a set in capitals. PX4 has
+        names in capitals only. A name that is listed in lower case stays.
         """
-        is_open = self.identification.is_ardupilot and name.isascii() and name not in self.table.params
+        has_capitals = self.identification.is_ardupilot or self.identification.is_px4
+        is_open = has_capitals and name.isascii() and name not in self.table.params
         return name.upper() if is_open else name
 
     async def confirm(self, vehicles: int) -> None:

@@ -39,6 +39,13 @@ def test_get_takes_patterns_and_any_case(command: Command, put: Put, vehicle: Ve
     assert row[:2] == ["MC_ROLL_P", "4.0"]
 
 
+def test_a_name_in_lower_case_is_found_without_a_table(command: Command, put: Put) -> None:
+    vehicle = PX4Vehicle(table={"lower_name": 5, "UPPER": 1.0})
+    assert command("get", put(vehicle), "lower_name").code == 0
+    assert command("set", put(vehicle), "lower_name", "6").code == 0
+    assert vehicle.values["lower_name"] == 6
+
+
 def test_a_name_that_fits_two_parameters_in_other_cases_is_not_written(command: Command, put: Put) -> None:
     vehicle = GenericVehicle({"Gain": 1.0, "gain": 2.0}, param_error=True)
     assert command("fetch", put(vehicle)).code == 0
