@@ -8,8 +8,6 @@ The metadata is optional. It comes from a file (`read_metadata`) or from the veh
 - `download`: downloads from a vehicle.
 """
 
-from __future__ import annotations
-
 from paramclient.metadata.download import metadata_of
 from paramclient.metadata.info import Metadata, ParamInfo
 from paramclient.metadata.store import (

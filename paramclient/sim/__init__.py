@@ -24,8 +24,6 @@ The vehicles behave as measured on real ones, with the real timing. The docstrin
 - `air`: the faulty link.
 """
 
-from __future__ import annotations
-
 from paramclient.sim.air import Air, Endpoint, FaultyLink
 from paramclient.sim.ardupilot import ArduPilotVehicle
 from paramclient.sim.camera import Camera, ExtEntries, camera_table

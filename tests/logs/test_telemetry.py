@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 
 import anyio
@@ -119,14 +118,8 @@ async def test_requests_to_a_log_fail(tmp_path: Path) -> None:
     path = whole(A=1).write(tmp_path / "flight.tlog")
     async with a_replay(path) as client:
         component = await client.component()
-        calls: Sequence[Callable[[], Awaitable[object]]] = (
-            lambda: component.get("A"),
-            lambda: component.set("A", 2),
-            lambda: component.fetch_all(refresh=True),
-        )
-        for call in calls:
-            with pytest.raises(UsageError, match=r"only listens|may not request"):
-                await call()
+        with pytest.raises(UsageError, match="only listens"):
+            await component.set("A", 2)
         began = anyio.current_time()
         with pytest.raises(NoReply, match="component 9/9"):
             await client.component(9, 9)

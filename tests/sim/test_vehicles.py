@@ -70,23 +70,6 @@ class TestEveryVehicle:
         )
         assert not vehicle.requests
 
-    def test_a_reboot_keeps_only_the_values(self, kind: Callable[[], Vehicle]) -> None:
-        vehicle = kind()
-        name = next(iter(vehicle.params))
-        station = Station(vehicle).send(LIST)
-        vehicle.set_param(name, 3)
-        vehicle.reboot(station.now, down=2.0)
-        assert vehicle.next_deadline() == 2.0
-        station.log.clear()
-        station.send(LIST).wait(1.9)
-        assert station.log == []
-        station.wait(0.2)
-        kinds = [type(message) for _, _, message in station.log]
-        assert kinds in ([messages.Heartbeat], [messages.Heartbeat, messages.SystemTime])
-        assert station.log[0][1].sequence == 0
-        assert vehicle.param(name).value == 3
-        assert len(station.ask(LIST, seconds=1.5)) >= len(vehicle.params)
-
 
 class TestPX4:
     def test_invalid_requests_are_not_answered(self) -> None:
