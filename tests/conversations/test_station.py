@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterable
 from functools import partial
 
@@ -31,6 +32,11 @@ GCS = messages.Heartbeat(messages.MAV_TYPE_GCS, messages.MAV_AUTOPILOT_INVALID, 
 CAMERA = messages.Heartbeat(30, messages.MAV_AUTOPILOT_INVALID, system_status=4)
 KEY = SigningKey(bytes(range(32)))
 NOW = 36_000_000_000_000
+
+
+def value_a(value: int) -> messages.ParamValue:
+    """Return a value of the parameter A."""
+    return messages.ParamValue("A", struct.pack("<i", value), ParamType.INT32, 10, 0)
 
 
 class Nothing(Puppet):
@@ -134,8 +140,7 @@ async def test_the_heartbeat_of_a_vehicle_that_sends_other_messages_is_requested
 
 async def test_another_hardware_id_clears_the_table_and_the_first_one_does_not() -> None:
     async with converse(Nothing()) as conversation:
-        conversation.hear(PX4)
-        conversation.hear(messages.ParamValue("A", bytes(4), 6, 10, 0))
+        conversation.hear(PX4, value_a(0))
         node = conversation.station.nodes[1, 1]
         for uid, replaced in ((0, 0), (7, 0), (7, 0), (8, 1)):
             conversation.hear(messages.AutopilotVersion(0, uid=uid))
@@ -153,7 +158,7 @@ async def test_ground_stations_are_asked_nothing_and_own_and_nameless_frames_are
             (messages.StatusText(6, "x"), 3, 1),
         ):
             conversation.hear(message, system=system, component=component)
-        conversation.hear(messages.ParamValue("A", bytes(4), 6, 1, 0), system=4)
+        conversation.hear(value_a(0), system=4)
         await anyio.sleep(3.0)
         assert list(conversation.station.nodes) == [(254, 190), (4, 1)]
         assert {each.target_system for each in conversation.sent_of(messages.CommandLong)} == {4}
@@ -204,8 +209,7 @@ def test_the_heartbeat_timeout_follows_slow_heartbeats_and_satellites() -> None:
 
 async def test_a_vehicle_on_a_satellite_link_is_lost_later() -> None:
     async with converse(Nothing()) as conversation:
-        conversation.hear(PX4)
-        conversation.hear(messages.HighLatency2(2, 12))
+        conversation.hear(PX4, messages.HighLatency2(2, 12))
         await anyio.sleep(50.0)
         assert not conversation.of("lost")
         await anyio.sleep(15.0)
@@ -244,11 +248,11 @@ async def test_clocks_of_different_messages_are_not_compared_and_two_signs_are_o
                 node.boot_clock(number, boot_ms, anyio.current_time())
             await anyio.sleep(1.0)
         assert not conversation.of("rebooted")
-        conversation.hear(messages.ParamValue("A", bytes(4), 6, 10, 0))
-        conversation.hear(messages.Heartbeat(2, 12, system_status=messages.MAV_STATE_BOOT))
+        conversation.hear(value_a(0), messages.Heartbeat(2, 12, system_status=messages.MAV_STATE_BOOT))
         node.boot_clock(30, 500, anyio.current_time())
-        conversation.hear(messages.SystemTime(0, 700))
-        conversation.hear(messages.Heartbeat(2, 12, system_status=messages.MAV_STATE_BOOT))
+        conversation.hear(
+            messages.SystemTime(0, 700), messages.Heartbeat(2, 12, system_status=messages.MAV_STATE_BOOT)
+        )
         assert len(conversation.of("rebooted")) == 1
         assert str(node.plain.table.params["A"].trust) == "cached"
 
@@ -351,23 +355,21 @@ async def test_commands_end_with_their_result_and_wait_while_one_is_in_progress(
 
 async def test_a_second_vehicle_with_the_same_ids_is_ignored_until_the_first_is_silent() -> None:
     async with converse(Nothing()) as conversation:
-        conversation.hear(PX4, peer="a")
-        conversation.hear(messages.ParamValue("A", b"\1\0\0\0", 6, 10, 0), peer="a")
+        conversation.hear(PX4, value_a(1), peer="a")
         node = conversation.station.nodes[1, 1]
         await anyio.sleep(1.0)
-        conversation.hear(messages.ParamValue("A", b"\2\0\0\0", 6, 10, 0), peer="b")
+        conversation.hear(value_a(2), peer="b")
         now = anyio.current_time()
         assert (node.plain.table.params["A"].value, node.peer, node.has_rival(now)) == (1, "a", True)
         await anyio.sleep(5.5)
         assert not node.has_rival(anyio.current_time())
-        conversation.hear(messages.ParamValue("A", b"\2\0\0\0", 6, 10, 0), peer="b")
+        conversation.hear(value_a(2), peer="b")
         assert (node.plain.table.params["A"].value, node.peer) == (2, "b")
 
 
 async def test_the_same_hardware_id_proves_that_a_vehicle_has_moved() -> None:
     async with converse(Nothing()) as conversation:
-        conversation.hear(PX4, peer="a")
-        conversation.hear(messages.AutopilotVersion(0, uid=7), peer="a")
+        conversation.hear(PX4, messages.AutopilotVersion(0, uid=7), peer="a")
         node = conversation.station.nodes[1, 1]
         conversation.hear(messages.AutopilotVersion(0, uid=8), peer="b")
         assert node.peer == "a"
@@ -378,8 +380,7 @@ async def test_the_same_hardware_id_proves_that_a_vehicle_has_moved() -> None:
 async def test_a_vehicle_at_another_peer_may_be_another_one_until_it_is_identified() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(messages.HighLatency2(2, 12), peer="a")  # it counts as lost only after a minute
-        conversation.hear(messages.AutopilotVersion(0, uid=7), peer="a")
-        conversation.hear(messages.ParamValue("A", b"\1\0\0\0", 6, 10, 0), peer="a")
+        conversation.hear(messages.AutopilotVersion(0, uid=7), value_a(1), peer="a")
         node = conversation.station.nodes[1, 1]
         await anyio.sleep(5.5)
         asked = len(conversation.sent_of(messages.CommandLong))
@@ -395,9 +396,7 @@ async def test_split_peers_are_components_of_their_own() -> None:
     async with converse(Nothing(), split_peers=True) as conversation:
         for peer in (("10.0.0.1", 1), ("10.0.0.2", 1)):
             conversation.hear(PX4, peer=peer)
-            conversation.hear(
-                messages.ParamValue("A", bytes((peer[0] == "10.0.0.1", 0, 0, 0)), 6, 1, 0), peer=peer
-            )
+            conversation.hear(value_a(peer[0] == "10.0.0.1"), peer=peer)
         nodes = list(conversation.station.nodes.values())
         assert [each.plain.table.params["A"].value for each in nodes] == [1, 0]
         assert find(nodes, 1, 1, "10.0.0.2") is nodes[1]

@@ -131,11 +131,12 @@ class Conversation:
         """Return the sent messages of a kind."""
         return [each for data in self.sent for each in messages_in(data) if isinstance(each, kind)]
 
-    def hear(self, message: Message, *, system: int = 1, component: int = 1, peer: object = "sim") -> None:
-        """Receive a message now, beside those of the endpoint."""
-        self._sequence = (self._sequence + 1) & 0xFF
-        data = encode(message, system=system, component=component, sequence=self._sequence)
-        self.station.receive(data, peer, anyio.current_time())
+    def hear(self, *messages: Message, system: int = 1, component: int = 1, peer: object = "sim") -> None:
+        """Receive messages now, beside those of the endpoint."""
+        for message in messages:
+            self._sequence = (self._sequence + 1) & 0xFF
+            data = encode(message, system=system, component=component, sequence=self._sequence)
+            self.station.receive(data, peer, anyio.current_time())
 
     async def node(self, system: int = 1, component: int = 1) -> Node:
         """Wait for a component."""
