@@ -15,7 +15,7 @@ from paramclient.links import SimLink
 from paramclient.model.values import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, SimParam
 from tests.client.conftest import connected, fetched
-from tests.shell import FlakyLink, Tap, a_client, outcome, tasks_beside
+from tests.shell import FlakyLink, Tap, outcome, tasks_beside
 
 LOG = bytes(range(256)) * 200
 """A file of 51,200 bytes, which takes a second."""
@@ -39,36 +39,39 @@ async def test_a_time_limit_ends_a_read_and_closes_the_file() -> None:
         assert not vehicle.open_files
 
 
-@pytest.mark.parametrize("how", ["timeout", "error", "cancelled", "scope"])
+@pytest.mark.parametrize("how", ["timeout", "error", "task", "all tasks", "scope"])
 async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str) -> None:
+    """All tasks are cancelled, each for itself, by `asyncio.run` when its main task has ended."""
     requests = 0
     for step in range(1, 40):
-        vehicle = ArduPilotVehicle(live_period=0)
+        vehicle, seconds = ArduPilotVehicle(live_period=0), step / 100
+        air = Air.symmetric([vehicle], delay=0.02)
 
-        async def session(vehicle: ArduPilotVehicle, seconds: float) -> None:
-            async with connected(Air.symmetric([vehicle], delay=0.02)) as (_, component):
-                if how == "error":
-                    fetching = asyncio.ensure_future(outcome(component.fetch_all()))
-                    await anyio.sleep(seconds)
-                    assert not fetching.done()
-                    raise RuntimeError("of the body")
-                with suppress(NoReply):
-                    await component.fetch_all(timeout=seconds if how == "timeout" else None)
+        async def session(air: Air, seconds: float) -> None:
+            with anyio.move_on_after(seconds if how == "scope" else None) as scope:
+                async with connected(air) as (_, component):
+                    if how == "error":
+                        fetching = asyncio.ensure_future(outcome(component.fetch_all()))
+                        await anyio.sleep(seconds)
+                        assert not fetching.done()
+                        raise RuntimeError("of the body")
+                    with suppress(NoReply):
+                        await component.fetch_all(timeout=seconds if how == "timeout" else None)
+            assert scope.cancelled_caught == (how == "scope")
 
-        async def session_in_a_scope(vehicle: ArduPilotVehicle, seconds: float) -> None:
-            with anyio.move_on_after(seconds) as scope:
-                await session(vehicle, seconds)
-            assert scope.cancelled_caught
-
-        run = session_in_a_scope if how == "scope" else session
-        task = asyncio.ensure_future(run(vehicle, step / 100))
-        if how == "cancelled":
-            await anyio.sleep(step / 100)
-            task.cancel()
-        await asyncio.wait([task])
-        assert task.cancelled() == (how == "cancelled")
+        task = asyncio.ensure_future(session(air, seconds))
+        if how.endswith(("task", "tasks")):
+            await anyio.sleep(seconds)
+            for each in {task} if how == "task" else asyncio.all_tasks() - {asyncio.current_task()}:
+                each.cancel()
+        with anyio.fail_after(0.5 if how == "all tasks" else 5.0):
+            await asyncio.wait([task])
+        assert task.cancelled() == how.endswith(("task", "tasks"))
+        assert task.cancelled() or bool(task.exception()) == (how == "error")
         assert not tasks_beside()
-        assert how == "cancelled" or bool(task.exception()) == (how == "error")
+        if how == "all tasks":  # the vehicle ends its burst before it closes
+            await anyio.sleep(1.0)
+            air.tick(anyio.current_time())
         assert not vehicle.open_files
         requests += vehicle.requests["FILE_TRANSFER_PROTOCOL"]
     assert requests > 80
@@ -122,30 +125,6 @@ async def test_a_scope_ends_a_client_on_any_link(
     assert bool(vehicle.open_files) == (is_deaf or closes_after == 0.0)
     assert not tasks_beside()
     assert isinstance(await outcome(component.file_checksum("/x")), ClientClosed)
-
-
-async def test_tasks_that_are_cancelled_each_for_itself_leave_no_file_open() -> None:
-    """As `asyncio.run` does with all that remain when its main task has ended."""
-    vehicle = with_files()
-
-    air = Air.symmetric([vehicle], delay=0.02)
-
-    async def session() -> None:
-        async with a_client(air) as client:
-            await (await client.component()).fetch_all()
-
-    fetching = asyncio.ensure_future(session())
-    await anyio.sleep(0.25)
-    assert vehicle.open_files
-    for task in asyncio.all_tasks() - {asyncio.current_task()}:
-        task.cancel()
-    with anyio.fail_after(0.5):
-        await asyncio.wait([fetching])
-        assert fetching.cancelled()
-    await anyio.sleep(1.0)
-    air.tick(anyio.current_time())
-    assert not vehicle.open_files
-    assert not tasks_beside()
 
 
 async def test_a_read_goes_on_when_the_link_is_back() -> None:
