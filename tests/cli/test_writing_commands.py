@@ -5,21 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import anyio
 import pytest
 
-from paramclient import ParamCache, ParamClient, ParamType
-from paramclient.cache import StoredParam, TableState
+from paramclient import ParamCache, ParamClient
+from paramclient.cache import TableState
 from paramclient.cli import session as cli_session
 from paramclient.cli import signing as signing_commands
 from paramclient.links import SimLink
 from paramclient.model.identity import Identity
-from paramclient.model.values import Param, bits_of
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
 from paramclient.wire import messages
-from tests.caches import NOW, update
+from tests.caches import NOW, stored, update
 from tests.commands import Command, Put, behind
 from tests.shell import Late, PeersLink, Tap
 
@@ -31,6 +30,8 @@ LISTED = (
     "paramclient: 2 vehicles on this link: 1/1 PX4 quadrotor, 2/1 ArduPilot quadrotor. "
     "Choose one with --vehicle 1/1, or all with --vehicle all.\n"
 )
+Words: TypeAlias = Callable[[str], list[str]]
+"""Returns the arguments of a subcommand."""
 QUESTIONS = (messages.Heartbeat, messages.CommandLong)
 """What identifies vehicles."""
 
@@ -49,23 +50,19 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
 
 
 @pytest.fixture
-def words(tmp_path: Path, cache: Path) -> Callable[[str], list[str]]:
+def words(tmp_path: Path, cache: Path) -> Words:
     """Return the arguments of a subcommand that writes; only the vehicle is not named."""
     file = tmp_path / "wanted.param"
-    file.write_text("MC_ROLL_P,7.5\nMC_PITCH_P,7.5\n")
+    file.write_text("MC_ROLL_P,7\nMC_PITCH_P,7\n")
     key = tmp_path / "vehicle.key"
     key.write_bytes(bytes(range(101, 133)))
     key.chmod(0o600)
     source = Identity(9, URL, "beef000000000009")
-    bits = bits_of(7.5, ParamType.REAL32)
-    values = [
-        StoredParam.of(Param(name, 7.5, ParamType.REAL32, index, bits), NOW)
-        for index, name in enumerate(TABLE)
-    ]
+    values = [stored(name, 7, index=index) for index, name in enumerate(TABLE)]
     with ParamCache(cache) as kept:
         kept.save(update(*values, identity=source, table=TableState(count=2, complete=True, synced_at=NOW)))
     commands = {
-        "set": ["set", URL, "MC_ROLL_P", "7.5"],
+        "set": ["set", URL, "MC_ROLL_P", "7"],
         "apply": ["apply", URL, str(file), "--yes"],
         "apply to see": ["apply", URL, str(file), "--dry-run"],
         "apply from the cache": ["apply", URL, "cache:9", "--yes"],
@@ -101,7 +98,7 @@ def untouched(*vehicles: Vehicle) -> bool:
 @pytest.mark.parametrize("phase", [0.0, 0.7, 1.15])
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING, *SHOWING])
 def test_with_two_vehicles_nothing_is_written(
-    command: Command, put: Put, words: Callable[[str], list[str]], name: str, phase: float
+    command: Command, put: Put, words: Words, name: str, phase: float
 ) -> None:
     for first, second in ((0.0, phase), (phase, 0.0)):
         one, two = px4(), copter()
@@ -117,7 +114,7 @@ def test_with_two_vehicles_nothing_is_written(
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING])
 @pytest.mark.parametrize("system", [1, 2])
 def test_only_the_named_vehicle_is_written_to(
-    command: Command, put: Put, words: Callable[[str], list[str]], name: str, system: int
+    command: Command, put: Put, words: Words, name: str, system: int
 ) -> None:
     one, two = px4(), copter()
     put(Air([one, two] if system == 2 else [two, one]))
@@ -131,9 +128,7 @@ def test_only_the_named_vehicle_is_written_to(
 
 
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING])
-def test_the_only_vehicle_need_not_be_named(
-    command: Command, put: Put, words: Callable[[str], list[str]], name: str
-) -> None:
+def test_the_only_vehicle_need_not_be_named(command: Command, put: Put, words: Words, name: str) -> None:
     one = px4()
     put(Tap(Air([one])))  # the number of vehicles is not known
     done = command(*words(name))
@@ -144,7 +139,7 @@ def test_the_only_vehicle_need_not_be_named(
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING])
 @pytest.mark.parametrize("first", [0.0, 0.9])
 def test_component_chooses_between_two_autopilots_of_a_system(
-    command: Command, put: Put, words: Callable[[str], list[str]], name: str, first: float
+    command: Command, put: Put, words: Words, name: str, first: float
 ) -> None:
     one, two = px4(), copter(1, component=2)
     put(Air([Late(one, first), Late(two, 0.9 - first)]))
@@ -160,9 +155,7 @@ def test_component_chooses_between_two_autopilots_of_a_system(
         assert not untouched(one)
 
 
-def test_a_missing_system_is_not_replaced_by_another(
-    command: Command, put: Put, words: Callable[[str], list[str]]
-) -> None:
+def test_a_missing_system_is_not_replaced_by_another(command: Command, put: Put, words: Words) -> None:
     one = px4()
     put(Air([one, copter()]))
     for name in WRITING:
@@ -176,7 +169,7 @@ def test_a_missing_system_is_not_replaced_by_another(
 
 @pytest.mark.parametrize("name", ["apply", "restore"])
 def test_a_vehicle_that_appears_during_the_read_stops_the_write(
-    command: Command, put: Put, cache: Path, words: Callable[[str], list[str]], name: str
+    command: Command, put: Put, cache: Path, words: Words, name: str
 ) -> None:
     table = {**TABLE, **{f"PARAM_{number:03}": number for number in range(300)}}
     one, two = px4(table=table, burst=1, period=0.02), copter()
@@ -203,7 +196,7 @@ def test_a_vehicle_that_appears_during_the_metadata_download_is_not_written_to(
         await anyio.sleep(15.0)
 
     monkeypatch.setattr("paramclient.cli.set_command.known_of_session", slowly)
-    done = command("set", URL, "MC_ROLL_P", "7.5")
+    done = command("set", URL, "MC_ROLL_P", "7")
     assert (done.code, done.out) == (2, "")
     gone = "1/1 px4 is no longer heard; 2/1 ArduPilot quadrotor is heard instead. Nothing was written."
     assert (gone if is_replaced else LISTED) in done.err
@@ -229,13 +222,11 @@ def test_values_of_an_ambiguous_source_are_not_used(
 
 
 @pytest.mark.parametrize("name", ["apply", "apply from the cache"])
-def test_all_writes_to_every_vehicle(
-    command: Command, put: Put, words: Callable[[str], list[str]], name: str
-) -> None:
+def test_all_writes_to_every_vehicle(command: Command, put: Put, words: Words, name: str) -> None:
     one, two = px4(), copter()
     put(Air([one, Late(two, 0.9)]))
     assert command(*words(name), "--vehicle", "all").code == 0
-    assert one.values["MC_ROLL_P"] == two.values["MC_ROLL_P"] == 7.5
+    assert one.values["MC_ROLL_P"] == two.values["MC_ROLL_P"] == 7
 
 
 # time
@@ -245,13 +236,13 @@ def test_a_simulated_link_is_not_searched_for_a_second_vehicle(
     command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     behind(monkeypatch, URL)(SimLink(Air([Air([px4()])]), "sim:px4"))
-    assert command("set", URL, "MC_ROLL_P", "7.5", "--timeout", "0.9").code == 0
+    assert command("set", URL, "MC_ROLL_P", "7", "--timeout", "0.9").code == 0
 
 
 def test_a_short_timeout_reports_the_remaining_wait(command: Command, put: Put) -> None:
     one = px4()
     put(Tap(one))
-    done = command("set", URL, "MC_ROLL_P", "7.5", "--timeout", "1")
+    done = command("set", URL, "MC_ROLL_P", "7", "--timeout", "1")
     assert (done.code, done.out) == (3, "")
     assert "an autopilot, then 1.2 s without another vehicle" in done.err
     assert untouched(one)
