@@ -78,22 +78,15 @@ def info_json(info: ParamInfo) -> JsonObject:
     return {name: each for name, each in found.items() if each not in (None, "", {}) and each is not False}
 
 
-def param_json(
-    param: Param,
-    info: ParamInfo | None = None,
-    *,
-    described: int | float | None = None,
-    whole: bool = False,
-) -> JsonObject:
+def param_json(param: Param, info: ParamInfo | None = None, *, whole: bool = False) -> JsonObject:
     """Return a parameter with its default, also that of the metadata; in the command its name is the key.
 
     Args:
         param: the parameter.
         info: its metadata, or None.
-        described: its default in the metadata, where `info` is None; or None.
         whole: whether to include all metadata.
     """
-    default = default_of(param, described if info is None else info.default)
+    default = default_of(param, None if info is None else info.default)
     return {
         "value": param_value(param),
         "type": param.type.name,
@@ -108,18 +101,12 @@ def param_json(
     )
 
 
-def table_param_json(
-    param: Param,
-    info: ParamInfo | None = None,
-    *,
-    described: int | float | None = None,
-    whole: bool = False,
-) -> JsonObject:
+def table_param_json(param: Param, info: ParamInfo | None = None, *, whole: bool = False) -> JsonObject:
     """Return a parameter as `param_json` does, with its name and its trust."""
-    is_changed = add_default(param, described if info is None else info.default).is_changed
+    is_changed = add_default(param, None if info is None else info.default).is_changed
     return {
         "name": param.name,
-        **param_json(param, info, described=described, whole=whole),
+        **param_json(param, info, whole=whole),
         **known_members(is_default=None if is_changed is None else not is_changed, trust=param.trust),
     }
 
@@ -180,9 +167,9 @@ def set_json(params: ParamSet, sources: Mapping[str, str] | None = None) -> Json
 
 
 def fetch_json(
-    component: Component, result: FetchResult, params: Iterable[Param], described: Mapping[str, int | float]
+    component: Component, result: FetchResult, params: Iterable[Param], metadata: Metadata | None
 ) -> JsonObject:
-    """Return a fetch with these parameters; `described` has defaults of the metadata by name."""
+    """Return a fetch with these parameters."""
     return {
         **taken(component, "system", "component", "autopilot"),
         "uid": component.identity.uid,
@@ -192,7 +179,10 @@ def fetch_json(
         "round_trip_s": rounded(result.round_trip),
         "elapsed_s": round(result.elapsed, 4),
         **taken(component.core.link_task, "bytes_received", "bytes_sent"),
-        "params": {each.name: param_json(each, described=described.get(each.name)) for each in params},
+        "params": {
+            each.name: param_json(each, None if metadata is None else metadata.find(each.name))
+            for each in params
+        },
     }
 
 

@@ -30,7 +30,8 @@ from paramclient.metadata import (
 )
 from paramclient.metadata.store import AddedFiles
 from paramclient.model.names import counted
-from paramclient.model.paramset import Default, DefaultSource, ParamSet
+from paramclient.model.paramset import Default, DefaultSource, ParamSet, WrittenParam, default_of
+from paramclient.model.values import Param
 from paramclient.protocol.fetch import Progress
 
 VEHICLE: Final = "vehicle"
@@ -154,6 +155,12 @@ def info_of(metadata: Metadata | None, name: str) -> ParamInfo | None:
 def defaults_in(metadata: Metadata | None, names: Iterable[str]) -> Mapping[str, int | float]:
     """Return the defaults that metadata gives for parameters, by name; see `default_of`."""
     return {} if metadata is None else metadata.defaults_of(names)
+
+
+def default_in(metadata: Metadata | None, param: Param | WrittenParam) -> Default | None:
+    """Return the default of a parameter: that of the vehicle, else that of the metadata; see `default_of`."""
+    info = info_of(metadata, param.name)
+    return default_of(param, None if info is None else info.default)
 
 
 def say_sources(label: str, defaults: Iterable[Default | None]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Final
 
@@ -13,7 +13,7 @@ import anyio
 from paramclient.cli.json_output import JsonObject, fetch_json, param_json, param_value
 from paramclient.cli.metadata import (
     MetadataChoice,
-    defaults_in,
+    default_in,
     info_of,
     known_of_session,
     no_defaults,
@@ -40,7 +40,7 @@ from paramclient.links import ReplayLink
 from paramclient.metadata import Metadata
 from paramclient.model.names import NameChoice, counted, first_of
 from paramclient.model.notation import hash_text, rounded, time_text
-from paramclient.model.paramset import add_default, default_of
+from paramclient.model.paramset import Default
 from paramclient.model.values import Param, format_value
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult
@@ -73,20 +73,19 @@ async def fetch(
         async def work(session: CommandSession) -> _Fetched:
             result = await session.fetch(refresh=refresh)
             params = by_index(each for name, each in result.params.items() if name not in result.cached)
-            unknown = [param.name for param in params if param.default is None]
-            described: Mapping[str, int | float] = {}
-            if unknown and (changed or options.json or metadata is not None):
-                described = defaults_in(await known_of_session(session, metadata), unknown)
-            filled = {param.name: add_default(param, described.get(param.name)) for param in params}
-            if changed and all(param.default is None for param in filled.values()):
+            known = None
+            if changed or options.json or metadata is not None:
+                known = await known_of_session(session, metadata)
+            defaults = {param.name: default_in(known, param) for param in params}
+            if changed and not any(defaults.values()):
                 raise VehicleError(no_defaults(), *session.component.address)
-            kept = chosen.choose(filled) if names else filled
+            kept = chosen.choose(defaults) if names else defaults.keys()
             params = [
                 param
                 for param in params
-                if param.name in kept and not (changed and not filled[param.name].is_changed)
+                if param.name in kept and (not changed or _is_changed(param, defaults[param.name]))
             ]
-            return _Fetched(session, result, params, described, shows_defaults=changed)
+            return _Fetched(session, result, params, known, shows_defaults=changed)
 
         done = await found.work(work)
     return found.show(done)
@@ -120,6 +119,10 @@ async def get(
     return found.show(done)
 
 
+def _is_changed(param: Param, default: Default | None) -> bool:
+    return default is not None and replace(param, default=default.value).is_changed is True
+
+
 @dataclass(slots=True)
 class _Fetched:
     """The parameters that were received or confirmed in this session: values that are only cached are not.
@@ -128,7 +131,7 @@ class _Fetched:
         session: the vehicle.
         result: the fetch.
         params: the parameters.
-        described: the defaults in the metadata by name, where the vehicle has given none.
+        metadata: the metadata of the vehicle for its defaults, or None.
         shows_defaults: whether the table has the defaults.
     """
 
@@ -137,7 +140,7 @@ class _Fetched:
     session: CommandSession
     result: FetchResult
     params: list[Param]
-    described: Mapping[str, int | float]
+    metadata: Metadata | None
     shows_defaults: bool
 
     def report(self) -> int:
@@ -147,8 +150,7 @@ class _Fetched:
             report(f"{session.prefix}{note}")
         if not session.options.json:
             if self.shows_defaults:
-                known = (default_of(param, self.described.get(param.name)) for param in self.params)
-                say_sources(session.label, known)
+                say_sources(session.label, (default_in(self.metadata, param) for param in self.params))
             say(self._summary)
         if not result.missing:
             return ExitCode.DONE
@@ -176,12 +178,12 @@ class _Fetched:
 
     def as_json(self) -> JsonObject:
         """Return the JSON object."""
-        return fetch_json(self.session.component, self.result, self.params, self.described)
+        return fetch_json(self.session.component, self.result, self.params, self.metadata)
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the cells of each parameter."""
         for param in self.params:
-            default = default_of(param, self.described.get(param.name)) if self.shows_defaults else None
+            default = default_in(self.metadata, param) if self.shows_defaults else None
             value, kind = format_value(param.settable, param.type), param.type.name
             changed = default and format_value(default.value, param.type)
             yield param.name, value, kind, param.index, param.trust, changed

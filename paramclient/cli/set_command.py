@@ -13,7 +13,7 @@ from cyclopts.validators import Number
 
 from paramclient.cli.metadata import (
     MetadataChoice,
-    defaults_in,
+    default_in,
     info_of,
     known_of_session,
     no_defaults,
@@ -29,7 +29,7 @@ from paramclient.errors import NoReply, ParamClientError, UnknownParameter, Usag
 from paramclient.metadata import Metadata
 from paramclient.metadata.info import ParamInfo, number_of
 from paramclient.model.names import counted, first_of, is_pattern
-from paramclient.model.paramset import ParamSet, default_of
+from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Value, check_name, format_value, parse_ext_value
 
 if TYPE_CHECKING:
@@ -214,8 +214,8 @@ async def reset(
         params, errors = await get_chosen(session, chosen or ["*"], is_fetched=True)
         for error in errors.values():
             raise error
-        known = defaults_in(await _known(session, metadata, params), [each.name for each in params])
-        found = {param.name: default_of(param, known.get(param.name)) for param in params}
+        known = await _known(session, metadata, params)
+        found = {param.name: default_in(known, param) for param in params}
         wanted = {name: default.value for name, default in found.items() if default is not None}
         if not wanted:
             raise VehicleError(no_defaults(), *session.component.address)

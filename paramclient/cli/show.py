@@ -19,7 +19,7 @@ from paramclient.cli.json_output import (
 from paramclient.cli.metadata import (
     METADATA_HINT,
     MetadataFile,
-    defaults_in,
+    default_in,
     info_of,
     known_of_sets,
     no_defaults,
@@ -45,7 +45,7 @@ from paramclient.model.comparison import non_defaults
 from paramclient.model.identity import autopilot_name, has_autopilot
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import time_text
-from paramclient.model.paramset import ParamSet, add_default, default_of
+from paramclient.model.paramset import ParamSet, add_defaults
 from paramclient.model.values import check_name, format_value
 from paramclient.provision.sources import link_of, read_source, resolve, tables_in
 
@@ -115,11 +115,9 @@ class _View:
 
     def __init__(self, params: ParamSet, metadata: Metadata | None, is_changed: bool) -> None:
         self._metadata, self._is_changed = metadata, is_changed
-        more = defaults_in(metadata, params)
-        found = {name: default_of(param, more.get(name)) for name, param in params.items()}
+        found = {name: default_in(metadata, param) for name, param in params.items()}
         self.defaults = {name: default for name, default in found.items() if default is not None}
-        filled = {name: add_default(param, more.get(name)) for name, param in params.items()}
-        self._shown = replace(params, params=filled)
+        self._shown = add_defaults(params, {name: each.value for name, each in self.defaults.items()})
         if is_changed:
             self._shown = non_defaults(self._shown)
 

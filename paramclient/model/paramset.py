@@ -243,7 +243,7 @@ def add_default(param: AnyParam, described: Value | None) -> AnyParam:
     return param if default is None else replace(param, default=default.value)
 
 
-def add_defaults(params: ParamSet, described: Mapping[str, int | float]) -> ParamSet:
+def add_defaults(params: ParamSet, described: Mapping[str, Value]) -> ParamSet:
     """Return a parameter set with its defaults; see `default_of`.
 
     Args:

@@ -358,7 +358,7 @@ async def fetch(target: TargetArgument, body: FetchRequest) -> JsonObject:
     if body.metadata:
         await target.load_metadata(timeout=body.timeout_s)
     known = dict(component.params)
-    return json_output.fetch_json(component, result, known.values(), target.defaults_of(known))
+    return json_output.fetch_json(component, result, known.values(), target.metadata)
 
 
 # files
