@@ -421,48 +421,19 @@ class _Job:
         return bool(self.plan.to_write) or (self.options["reboot"] and bool(self.plan.awaiting_reboot))
 
     def report(self) -> int:
-        """Print a summary of the plan or of the result; return the exit code."""
-        if self.plan is not None:
-            return self._say_plan()
-        return ExitCode.DONE if self.result is None else self._say_result()
+        """Print counts, what was left out with the options that write it, and what was not checked.
 
-    def _say_plan(self) -> int:
-        """Print a summary of the plan; return the exit code that the command is expected to have."""
-        session, made = self.session, self.plan
-        assert made is not None
-        if not session.options.json:
-            if made.firmware_note:
-                say(f"{session.label}: {made.firmware_note}")
-            reboot_for = () if self.options["reboot"] else made.reboot_for
-            self._say(made, made, "; nothing was sent", "would take effect", reboot_for)
-        code = ExitCode.INCOMPLETE if self.state.is_part else ExitCode.DONE
-        if any(not row.is_as_wanted for row in made.of(ApplyStatus.SKIPPED, ApplyStatus.INVALID)):
-            code = ExitCode.INCOMPLETE
-        if session.component.is_armed and not self.options["allow_armed"]:
-            report(f"{session.label} is armed; nothing would be set now without --allow-armed")
-            code = ExitCode.INCOMPLETE
-        if self._is_refused:
-            names = first_of([*made.problems], LINE_NAMES_MAX)
-            report(f"{session.label}: nothing would be sent without --partial: {names}")
-            code = ExitCode.USAGE
-        return code
-
-    def _say_result(self) -> int:
-        """Print what became of the vehicle; return the exit code."""
-        result, session = self.result, self.session
-        assert result is not None
-        end = f" in {result.elapsed:.1f} s"
-        self._say(result, result.plan, end, "takes effect", result.reboot_required)
-        if result.system != session.component.system:
-            say(f"{session.address} is {result.system}/{result.component} now")
-        if result.error is not None:
-            report(f"{session.label}: {result.error}; {self.to_continue}")
-            return max(code_of(result.error), ExitCode.INCOMPLETE)
-        is_done = result.complete and not self.state.is_part
-        return ExitCode.DONE if is_done else ExitCode.INCOMPLETE
-
-    def _say(self, shown: Rows, made: Plan, end: str, effect: str, reboot_for: Sequence[str]) -> None:
-        """Print counts, what was left out with the options that write it, and what was not checked."""
+        Returns:
+            The exit code; of a plan, the one that the command is expected to have.
+        """
+        result, label = self.result, self.session.label
+        made = self.plan if result is None else result.plan
+        if made is None:  # interrupted
+            return ExitCode.DONE
+        shown: Rows = made if result is None else result
+        end, reboot_for = "; nothing was sent", () if self.options["reboot"] else made.reboot_for
+        if result is not None:
+            end, reboot_for = f" in {result.elapsed:.1f} s", result.reboot_required
         words = (f"{count} {_WORDS.get(status, status)}" for status, count in shown.counts.items())
         say(f"{self.session.receiver}: {', '.join(words) or 'nothing to set'}{end}")
         left_out = Counter(
@@ -470,7 +441,6 @@ class _Job:
             for row in shown.of(ApplyStatus.SKIPPED)
             if row.category in CATEGORIES and row.category != READ_ONLY and row.differs
         )
-        label = self.session.label
         if left_out:
             listed = ", ".join(f"{count} {category}" for category, count in left_out.items())
             options = " ".join(f"--include {category}" for category in left_out)
@@ -478,7 +448,35 @@ class _Job:
         if made.unchecked_note:
             say(f"{label}: {made.unchecked_note}")
         if reboot_for:
-            say(f"{label}: {effect} after a reboot: {first_of(reboot_for, LINE_NAMES_MAX)}")
+            say(f"{label}: takes effect after a reboot: {first_of(reboot_for, LINE_NAMES_MAX)}")
+        code = self._report_plan(made) if result is None else self._report_result(result)
+        return max(code, ExitCode.INCOMPLETE) if self.state.is_part else code
+
+    def _report_plan(self, made: Plan) -> int:
+        """Print what the firmware and the armed state say about a plan, and whether it is refused."""
+        label, code = self.session.label, ExitCode.DONE
+        if made.firmware_note:
+            say(f"{label}: {made.firmware_note}")
+        if any(not row.is_as_wanted for row in made.of(ApplyStatus.SKIPPED, ApplyStatus.INVALID)):
+            code = ExitCode.INCOMPLETE
+        if self.session.component.is_armed and not self.options["allow_armed"]:
+            report(f"{label} is armed; nothing would be set now without --allow-armed")
+            code = ExitCode.INCOMPLETE
+        if self._is_refused:
+            names = first_of([*made.problems], LINE_NAMES_MAX)
+            report(f"{label}: nothing would be sent without --partial: {names}")
+            code = ExitCode.USAGE
+        return code
+
+    def _report_result(self, result: ApplyResult) -> int:
+        """Print a new system id, and the error that ended the run."""
+        session = self.session
+        if result.system != session.component.system:
+            say(f"{session.address} is {result.system}/{result.component} now")
+        if result.error is not None:
+            report(f"{session.label}: {result.error}; {self.to_continue}")
+            return max(code_of(result.error), ExitCode.INCOMPLETE)
+        return ExitCode.DONE if result.complete else ExitCode.INCOMPLETE
 
     @property
     def to_continue(self) -> str:
