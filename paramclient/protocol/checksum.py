@@ -7,7 +7,7 @@ between their ends differ. Where one value does, its new bits follow from each r
 row in which these are a simple value is probably the one.
 
 Such a value can also make up for other changes, and no checksum would show it. So each is read by its index
-too, but for those that always move: these are searched in a few rows. Nothing is taken over until the
+too, but for those that always move: these are searched alone. Nothing is taken over until the
 checksum of the whole file agrees.
 """
 
@@ -58,8 +58,6 @@ SECONDS_SLACK: Final = 40.0
 """By how much these may differ from the time that has passed: they are stored every 30 s."""
 PASSED_MAX: Final = 86_400.0
 """Seconds passed up to which fewer may have been counted: of a year, one in a hundred values fits."""
-NEAR: Final = 8
-"""Rows in which a value within wide limits explains a difference: by chance, it would explain others too."""
 MEASURED_ONCE: Final = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC")
 MEASURED: Final = re.compile(f"{MEASURED_ONCE.pattern}|{PRESSURE.pattern}")
 """Names that each start of the vehicle measures again (measured)."""
@@ -200,10 +198,8 @@ class _Proof:
 
     def _ends_of(self, indices: Collection[int], place: range) -> set[int]:
         """Return the numbers of rows whose checksums show these values, as far as they are in a range and not
-        known: behind each, and before those without another one near."""
-        ends = {at + 1 for at in indices if at in place}
-        starts = {end - 1 for end in ends if ends.isdisjoint(range(end - NEAR, end))}
-        return (ends | starts) - {0, *self._found}
+        known."""
+        return {end for at in indices if at in place for end in (at, at + 1)} - {0, *self._found}
 
     @property
     def _parts(self) -> int:
@@ -243,7 +239,7 @@ class _Proof:
         for at, bits in self._explanations(place, difference):
             row = self._rows[at]
             passed = now - moments.get(row.name, now)
-            if _has_just_moved(row, bits, passed, is_near=len(place) <= NEAR):
+            if _has_just_moved(row, bits, passed, is_alone=len(place) == 1):
                 return at, bits
         return None
 
@@ -364,15 +360,15 @@ class _Proof:
         return True
 
 
-def _has_just_moved(row: PackedParam, bits: int, passed: float, *, is_near: bool) -> bool:
-    """Return whether a value has grown by the seconds that have passed; or, where it is one of a few rows, by
-    fewer of them, as the vehicle was off meanwhile, or is the same day's pressure."""
+def _has_just_moved(row: PackedParam, bits: int, passed: float, *, is_alone: bool) -> bool:
+    """Return whether a value has grown by the seconds that have passed; or, where nothing else can have
+    changed, by fewer of them, as the vehicle was off meanwhile, or is the same day's pressure."""
     old, new = float(from_bits(row.bits, row.type)), float(from_bits(bits, row.type))
     if SECONDS.fullmatch(row.name) and row.type is ParamType.INT32:
-        fewest = 1 if is_near and passed <= PASSED_MAX else passed - SECONDS_SLACK
+        fewest = 1 if is_alone and passed <= PASSED_MAX else passed - SECONDS_SLACK
         return new > old and fewest <= new - old <= passed + SECONDS_SLACK
     is_pressure = PRESSURE.fullmatch(row.name) and row.type is ParamType.REAL32
-    return bool(is_pressure) and is_near and 0 < abs(new - old) <= PRESSURE_DRIFT * old
+    return bool(is_pressure) and is_alone and 0 < abs(new - old) <= PRESSURE_DRIFT * old
 
 
 def _bits_to_write(bits: int, kind: ParamType) -> float:

@@ -15,6 +15,7 @@ from paramclient.model.values import Param, Trust
 from paramclient.protocol.digest import ask, may_confirm
 from paramclient.protocol.fetch import Policy, differing, fetch_all
 from paramclient.protocol.presence import Presence
+from paramclient.protocol.reads import read_many
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import MAV_MODE_FLAG_SAFETY_ARMED
 
@@ -25,6 +26,9 @@ INTERVAL_DEFAULT: Final = 30.0
 SETTLING_TIME: Final = 0.5
 """Seconds from a sign of change to the check: PX4 pushes what a change has caused within 25 ms, and while an
 ArduPilot sends a list, the numbers of parameters before and after a change alternate."""
+OUTSIDE_AGE: Final = 120.0
+"""Seconds after which a check also reads the values that PX4's hash leaves out: their announcements may have
+been lost."""
 RETRY_INTERVAL: Final = 5.0
 """Seconds until the next check after one without an answer."""
 
@@ -175,10 +179,15 @@ class Watch:
         answer = await ask(session)
         if answer.reason and not answer.is_other and not was_doubted:
             return  # another station's file is open, for example
+        if not answer.is_current:
+            self._before, self._is_doubted = before, True
         if not answer.is_current or any(param.trust is Trust.CACHED for param in table.params.values()):
             result = await fetch_all(session, refresh=not answer.is_current)
             if not result.complete:
                 return
+        if answer.digest is not None:
+            old = anyio.current_time() - OUTSIDE_AGE
+            await read_many(session, [name for name in table.volatile if table.moments.get(name, old) < old])
         self._is_doubted = False
         self.confirmed_at = anyio.current_time()
         changed = differing(before, table.params)

@@ -124,6 +124,30 @@ async def test_a_check_that_fails_is_repeated_and_none_runs_beside_a_hold() -> N
         assert found.session.table.params["MC_ROLL_P"].value == 3.25
 
 
+async def test_values_outside_px4s_hash_are_read_every_two_minutes() -> None:
+    """The vehicle's announcement of the new value was lost."""
+    vehicle = PX4Vehicle()
+    async with watched(vehicle) as found:
+        assert found.session.table.volatile
+        vehicle.load({"CAL_MAG0_XOFF": 0.25})
+        before = found.requests
+        await anyio.sleep(90.0)
+        assert found.requests - before <= 10
+        await anyio.sleep(70.0)
+        assert found.session.table.params["CAL_MAG0_XOFF"].value == 0.25
+        assert found.resynced == [("CAL_MAG0_XOFF",)]
+
+
+async def test_a_table_that_is_known_to_differ_is_not_called_synced_while_it_is_fetched() -> None:
+    vehicle = PX4Vehicle()
+    async with watched(Air.symmetric([vehicle], delay=0.1), interval=10.0) as found:
+        vehicle.load({"MC_ROLL_P": 3.25})
+        while found.session.table.params["MC_ROLL_P"].value != 3.25:
+            is_fetching = found.session.fetching.is_running
+            assert found.watch.state is (SyncState.CHECKING if is_fetching else SyncState.SYNCED)
+            await anyio.sleep(0.05)
+
+
 async def test_a_list_for_another_station_is_taken_and_restarts_nothing() -> None:
     vehicle = PX4Vehicle()
     async with watched(vehicle, interval=0.0) as found:
