@@ -236,8 +236,8 @@ async def watch(url: str, /, *names: str, options: LinkOptions = _DEFAULTS) -> i
     """
     given = check_given(names)
     async with sessions(url, options, is_live=True) as found:
-        codes = [each.result for each in await found.work(partial(_watch, given=given, found=found))]
-    return max(code or ExitCode.DONE for code in codes)
+        codes = (await found.work(partial(_watch, given=given, found=found))).values()
+    return max([*codes, found.report_errors()])
 
 
 async def _watch(session: CommandSession, given: Sequence[str], found: Sessions) -> int:

@@ -121,7 +121,7 @@ async def _sets_of(where: str, options: LinkOptions, *, incomplete: bool) -> tup
         opened.report_others()
     for session, error in opened.errors.items():
         report(f"{session.address}: {error}")
-    return [each.result for each in done if each.result is not None], bool(opened.errors)
+    return [*done.values()], bool(opened.errors)
 
 
 def _differing(whole: ParamSet, metadata: Metadata | None) -> ParamSet | None:

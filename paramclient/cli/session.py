@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 import anyio
 
@@ -199,15 +199,6 @@ class CommandSession:
             raise AmbiguousVehicle(message, vehicles=(self.label, other), choose_by="component")
 
 
-@dataclass(frozen=True, slots=True)
-class Done(Generic[Result]):
-    """The outcome of the work on one vehicle: its result, or the error that ended it."""
-
-    session: CommandSession
-    result: Result | None = None
-    error: ParamClientError | None = None
-
-
 class Shown(Protocol):
     """What a subcommand prints of one vehicle: an object of JSON, or the rows of a table."""
 
@@ -241,38 +232,35 @@ class Sessions(list[CommandSession]):
         """Whether all vehicles of the link are meant."""
         return self[0].choice.is_all
 
-    async def work(self, work: Callable[[CommandSession], Awaitable[Result]]) -> list[Done[Result]]:
-        """Work on all vehicles concurrently; return the outcomes. A failure of one does not stop the others.
+    async def work(self, work: Callable[[CommandSession], Awaitable[Result]]) -> dict[CommandSession, Result]:
+        """Work on all vehicles concurrently; return the results. A failure of one does not stop the others.
 
         Raises:
             ParamClientError: the error of the vehicle, without --vehicle all.
         """
         if not self.is_all:
-            return [Done(self[0], await work(self[0]))]
-        done: dict[int, Done[Result]] = {}
+            return {self[0]: await work(self[0])}
+        found: dict[CommandSession, Result] = {}
 
-        async def run(place: int, session: CommandSession) -> None:
+        async def run(session: CommandSession) -> None:
             try:
-                if session in self.errors:
-                    raise self.errors[session]
-                done[place] = Done(session, result=await work(session))
+                found[session] = await work(session)
             except ParamClientError as error:
                 self.errors[session] = error
-                done[place] = Done(session, error=error)
 
         async with anyio.create_task_group() as tasks:
-            for place, session in enumerate(self):
-                tasks.start_soon(run, place, session)
-        return [done[place] for place in sorted(done)]
+            for session in self:
+                if session not in self.errors:
+                    tasks.start_soon(run, session)
+        return {session: found[session] for session in self if session in found}
 
-    def show(self, done: Sequence[Done[Shown]]) -> int:
-        """Print the results as one table or as JSON, then remarks and failures; return the exit code.
+    def show(self, results: Mapping[CommandSession, Shown]) -> int:
+        """Print results as one table or as JSON, then remarks and failures; return the exit code.
 
         If several vehicles are heard, and none was named, the table says which one it shows.
         """
         self.report_others()
-        found = [(each.session, each.result) for each in done if each.result is not None]
-        failed = [(each.session, each.error) for each in done if each.error is not None]
+        found = results.items()
         if not self[0].options.json:
             is_named = self.is_all or bool(self.others)
             rows = [
@@ -281,15 +269,18 @@ class Sessions(list[CommandSession]):
                 for cells in result.rows()
             ]
             if rows:
-                print_table(["vehicle", *found[0][1].columns], rows)
+                print_table(["vehicle", *next(iter(results.values())).columns], rows)
         elif self.is_all:
             vehicles = [session.ids | result.as_json() for session, result in found]
-            failures = [session.ids | {"error": str(error)} for session, error in failed]
+            failures = [session.ids | {"error": str(error)} for session, error in self.errors.items()]
             print_json({"vehicles": vehicles, "errors": failures})
         else:
-            print_json(found[0][1].as_json())
-        codes = [result.report() for _, result in found]
-        codes += [report_all([error], f"{session.label}: ") for session, error in failed]
+            print_json(results[self[0]].as_json())
+        return max([result.report() for result in results.values()] + [self.report_errors()])
+
+    def report_errors(self) -> int:
+        """Print the errors of vehicles whose work has failed; return the exit code."""
+        codes = [report_all([error], f"{session.label}: ") for session, error in self.errors.items()]
         return max(codes, default=ExitCode.DONE)
 
     @property

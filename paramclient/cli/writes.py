@@ -13,7 +13,7 @@ import anyio
 from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
 from paramclient.cli.metadata import info_of
 from paramclient.cli.output import LINE_NAMES_MAX, Coloured, ExitCode, Status, code_of, report, say
-from paramclient.cli.session import CommandSession, Done, Sessions, Shown
+from paramclient.cli.session import CommandSession, Sessions, Shown
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.names import counted, first_of
@@ -58,7 +58,7 @@ async def write_all(found: Sessions, jobs: Mapping[CommandSession, WriteJob]) ->
     try:
         return found.show(await found.work(lambda session: jobs[session].write()))
     except anyio.get_cancelled_exc_class():
-        found.show([Done(*job) for job in jobs.items()])
+        found.show(jobs)
         not_proven = counted(sum(job.open_count for job in jobs.values()), "value")
         to_continue = "; ".join(dict.fromkeys(job.to_continue for job in jobs.values()))
         say(f"interrupted: {not_proven} not proven, and others may be in flight; {to_continue}")

@@ -128,6 +128,8 @@ def test_one_vehicle_that_fails_stops_no_other(command: Command, put: Put) -> No
     assert read.code == 3
     assert [line[:2] for line in read.words[1:]] == [["1/1", "A"]]
     assert "3/1 px4: " in read.err
+    watched = command("watch", url, "A", "--vehicle", "all", "--timeout", "20")
+    assert (watched.code, "paramclient: 3/1 px4: " in watched.err) == (3, True)
 
 
 def test_set_and_reset_write_to_every_vehicle(command: Command, put: Put, tmp_path: Path) -> None:
