@@ -14,18 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from paramclient import (
-    ClientClosed,
-    FileTransferError,
-    InvalidParameters,
-    LinkError,
-    NoReply,
-    ParamCache,
-    Progress,
-    UnknownParameter,
-    UsageError,
-    Value,
-)
+from paramclient import ParamCache, Progress, Value, errors
 from paramclient.sync import Component, ParamClient, apply, for_each, plan, restore
 from tests.sync_stub import STUB, meaning, stub
 
@@ -63,16 +52,16 @@ def test_a_whole_session(tmp_path: Path) -> None:
         assert [len(vehicle.params), vehicle.params[NAME].value] == [903, 7.0]
         assert sum(1 for name in vehicle.params if vehicle.params[name].value == 7.0) >= 1
         assert vehicle.silence < 5.0
-        with pytest.raises(UnknownParameter):
+        with pytest.raises(errors.UnknownParameter):
             vehicle.get("NO_SUCH_NAME")
-        with pytest.raises(NoReply):
+        with pytest.raises(errors.NoReply):
             vehicle.ext.fetch_all(timeout=0.05)
-        with pytest.raises(FileTransferError):
+        with pytest.raises(errors.FileTransferError):
             vehicle.read_file("/no/such/file")
     assert next(changes).name == NAME, "what was queued"
-    with pytest.raises(ClientClosed):
+    with pytest.raises(errors.ClientClosed):
         changes.next(timeout=1.0)
-    with pytest.raises(ClientClosed):
+    with pytest.raises(errors.ClientClosed):
         vehicle.get(NAME)
     assert vehicle.params[NAME].value == 7.0
     assert "closed" in repr(client)
@@ -92,7 +81,7 @@ def test_a_vehicle_is_set_up_and_restored(tmp_path: Path) -> None:
         assert done.results[1, 1].complete
         assert (tmp_path / "1.params").exists()
         failed = for_each([vehicle], lambda each: apply(each, {"NO_SUCH": 6.5}))
-        assert isinstance(failed.errors[1, 1], InvalidParameters)
+        assert isinstance(failed.errors[1, 1], errors.InvalidParameters)
     assert not for_each([], lambda each: plan(each, {NAME: 6.5})).results
 
 
@@ -110,20 +99,20 @@ def test_an_error_of_a_callback_ends_the_call() -> None:
 
 def test_open_and_close() -> None:
     client = ParamClient("sim:px4", cache=False)
-    with pytest.raises(ClientClosed, match="not open"):
+    with pytest.raises(errors.ClientClosed, match="not open"):
         client.component()
     assert client.open() is client
-    with pytest.raises(UsageError, match="only once"):
+    with pytest.raises(errors.UsageError, match="only once"):
         client.open()
     vehicle = client.component()
     assert vehicle.get(NAME).value == 4.0
     client.close()
     client.close()
-    with pytest.raises(ClientClosed):
+    with pytest.raises(errors.ClientClosed):
         client.component()
-    with pytest.raises(UsageError, match="HTTP"):
+    with pytest.raises(errors.UsageError, match="HTTP"):
         ParamClient("http://127.0.0.1:8765")
-    with pytest.raises(LinkError), ParamClient("tcp:127.0.0.1:1", cache=False):
+    with pytest.raises(errors.LinkError), ParamClient("tcp:127.0.0.1:1", cache=False):
         pass
     assert not [each for each in threading.enumerate() if each.name.startswith("paramclient")]
 
@@ -143,7 +132,7 @@ def test_threads_share_a_client_and_closing_ends_their_calls() -> None:
         waiting = threads.submit(wait)
         begun.wait()
         client.close()
-        assert isinstance(waiting.exception(), ClientClosed)
+        assert isinstance(waiting.exception(), errors.ClientClosed)
 
 
 @pytest.mark.parametrize(
@@ -155,7 +144,7 @@ def test_ctrl_c_ends_a_call_and_the_client_goes_on(call: Callable[[ParamClient],
         timer.start()
         with pytest.raises(KeyboardInterrupt):
             call(client)
-        with pytest.raises(NoReply):
+        with pytest.raises(errors.NoReply):
             client.component(timeout=0.01)
 
 

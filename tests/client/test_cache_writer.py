@@ -19,16 +19,7 @@ import anyio.from_thread
 import anyio.lowlevel
 import pytest
 
-from paramclient import (
-    CacheError,
-    ClientClosed,
-    Component,
-    FetchResult,
-    ParamCache,
-    ParamClient,
-    Trust,
-    UsageError,
-)
+from paramclient import Component, FetchResult, ParamCache, ParamClient, Trust, errors
 from paramclient.client import cache_writer
 from paramclient.client import component as component_module
 from paramclient.model.paramset import ParamSet
@@ -244,7 +235,7 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
         waiting = asyncio.create_task(outcome(client.component()))
         await asyncio.sleep(0.1)
     await settled()
-    assert isinstance(waiting.result(), ClientClosed)
+    assert isinstance(waiting.result(), errors.ClientClosed)
 
 
 @pytest.mark.parametrize("fetched", [True, False])
@@ -351,9 +342,9 @@ async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_befor
 async def test_an_author_must_be_printable_ascii(path: Path, author: str) -> None:
     vehicle = small_px4()
     async with connected(vehicle, cache=path) as (_, component):
-        with pytest.raises(UsageError, match="author must have 1 to 128 printable ASCII"):
+        with pytest.raises(errors.UsageError, match="author must have 1 to 128 printable ASCII"):
             await component.set("PARAM_01", 100, author=author)
-        with pytest.raises(UsageError, match="author must have"):
+        with pytest.raises(errors.UsageError, match="author must have"):
             await apply(component, ParamSet({}), author=author)
 
 
@@ -403,7 +394,7 @@ async def test_a_cache_that_was_given_stays_open(path: Path) -> None:
     async with ParamClient(small_px4(), cache=path) as client:
         await client.component()
     assert client.cache is not None
-    with pytest.raises(CacheError, match="closed"):
+    with pytest.raises(errors.CacheError, match="closed"):
         client.cache.components()
 
 

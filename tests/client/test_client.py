@@ -15,19 +15,7 @@ import anyio
 import anyio.abc
 import pytest
 
-from paramclient import (
-    Change,
-    Changes,
-    ClientClosed,
-    Component,
-    Encoding,
-    LinkError,
-    NoReply,
-    ParamClient,
-    ParamType,
-    Progress,
-    UsageError,
-)
+from paramclient import Change, Changes, Component, Encoding, ParamClient, ParamType, Progress, errors
 from paramclient.client import link_task
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire import messages
@@ -80,13 +68,13 @@ async def test_an_exception_of_the_body_is_raised_unchanged() -> None:
     class Stop(BaseException):
         pass
 
-    errors: list[BaseException] = [
+    raised: list[BaseException] = [
         ValueError(),
         Stop(),
         asyncio.CancelledError(),
         ExceptionGroup("", [OSError()]),
     ]
-    for error in errors:
+    for error in raised:
         try:
             async with a_client(generic()) as client:
                 await client.component()
@@ -104,7 +92,7 @@ async def test_a_time_limit_around_the_client_ends_it() -> None:
     with pytest.raises(TimeoutError) as caught:
         async with asyncio.timeout(0.5), a_client(generic()) as client:
             await client.component(system=99)
-    assert not isinstance(caught.value, NoReply)
+    assert not isinstance(caught.value, errors.NoReply)
     with anyio.move_on_after(0.5) as scope:
         async with a_client(generic()) as client:
             await client.component(system=99)
@@ -127,13 +115,13 @@ def test_a_client_can_be_made_before_the_event_loop() -> None:
 async def test_calls_on_a_client_that_is_not_open() -> None:
     client = a_client(small_px4())
     for before in (client.component(), client.only_component(), client.fetch_all()):
-        with pytest.raises(ClientClosed, match="not open"):
+        with pytest.raises(errors.ClientClosed, match="not open"):
             await before
     async with client:
         component = await client.component()
         await component.fetch_all()
     for call in (*(call(client, component) for call in CALLS.values()), client.only_component()):
-        with pytest.raises(ClientClosed, match="was closed"):
+        with pytest.raises(errors.ClientClosed, match="was closed"):
             await call
     assert len(component.params) == 25, "what was known stays readable"
     assert not residue(component)
@@ -150,7 +138,7 @@ async def test_closing_while_the_link_is_disconnected() -> None:
         await asyncio.sleep(1.0)
         assert not any(task.done() for task in waiting.values())
     for name, task in waiting.items():
-        assert type(await task) is ClientClosed, name
+        assert type(await task) is errors.ClientClosed, name
     assert not tasks_beside()
 
 
@@ -167,24 +155,24 @@ LONG_CALLS: dict[str, Call] = {
 async def test_closing_ends_a_call_of_another_task_at_once(call: str) -> None:
     client = await a_client(PX4Vehicle(burst=1, period=0.05)).open()
     component = await client.component()
-    async with meanwhile(LONG_CALLS[call](client, component)) as errors:
+    async with meanwhile(LONG_CALLS[call](client, component)) as raised:
         await anyio.sleep(1.0)
         await client.aclose()
         closed_at = anyio.current_time()
     assert anyio.current_time() - closed_at < 0.1
-    assert [type(error) for error in errors] == [ClientClosed]
+    assert [type(error) for error in raised] == [errors.ClientClosed]
 
 
 @virtual_on_both
 async def test_a_call_that_begins_while_a_file_is_closed_on_board_ends_too() -> None:
     client = await a_client(Air.symmetric([ArduPilotVehicle()], delay=0.3)).open()
     component = await client.component()
-    async with meanwhile(component.fetch_all()) as errors:
+    async with meanwhile(component.fetch_all()) as raised:
         await anyio.sleep(1.3)
         async with meanwhile(client.aclose()):
             await anyio.sleep(0.01)
-            errors.append(await outcome(component.ext.fetch_all()))
-    assert [type(error) for error in errors] == [ClientClosed] * 2
+            raised.append(await outcome(component.ext.fetch_all()))
+    assert [type(error) for error in raised] == [errors.ClientClosed] * 2
 
 
 @pytest.mark.asyncio
@@ -229,7 +217,7 @@ async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
         param = await component.get("_HASH_CHECK")
         assert (param.value, param.type, param.index) == (vehicle.announced_hash(), ParamType.UINT32, None)
         assert "_HASH_CHECK" not in component.params
-        with pytest.raises(UsageError, match="_HASH_CHECK is read-only"):
+        with pytest.raises(errors.UsageError, match="_HASH_CHECK is read-only"):
             await component.set("_HASH_CHECK", 0)
 
 
@@ -245,7 +233,7 @@ async def test_invalid_values_and_names_are_not_sent() -> None:
         gets: list[Any] = [*names, -1, 32_768, 1.5]
         sets = [component.set(*each) for each in (*numbers, *texts, *((name, 1) for name in names))]
         for call in (*sets, *(component.get(each) for each in gets)):
-            with pytest.raises(UsageError):
+            with pytest.raises(errors.UsageError):
                 await call
         await settled()
         assert not tap.received
@@ -267,7 +255,7 @@ async def test_every_call_has_a_time_limit_of_its_own() -> None:
             "the parameters of 1/1": component.fetch_all(timeout=2.5),
         }
         for awaited, call in limited.items():
-            with pytest.raises(NoReply) as caught:
+            with pytest.raises(errors.NoReply) as caught:
                 await call
             error = caught.value
             assert error.awaited == awaited
@@ -350,7 +338,7 @@ async def test_a_silent_component_delays_no_other_component(autopilot: int) -> N
         assert everything.results.keys() == {(1, 1)}
         assert everything.silent.keys() == {(1, 100), (2, 1)}
         for error in everything.silent.values():
-            assert isinstance(error, NoReply)
+            assert isinstance(error, errors.NoReply)
             assert "sends messages" in str(error)
         assert everything.complete
         assert (await component.get("PARAM_01")).value == 1
@@ -371,7 +359,7 @@ async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
     async with a_client(generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
         assert (await client.fetch_all()).results.keys() == {(1, 100)}
         assert (await client.fetch_all(1)).results.keys() == {(1, 100)}
-        with pytest.raises(NoReply, match="system 2"):
+        with pytest.raises(errors.NoReply, match="system 2"):
             await client.fetch_all(2)
 
 
@@ -379,7 +367,7 @@ async def test_a_vehicle_that_answers_nothing_ends_a_fetch_within_7_s() -> None:
     for options in ({}, {"component": 100, "autopilot": messages.MAV_AUTOPILOT_INVALID}):
         async with a_client(silent(**options)) as client:
             await asyncio.sleep(1.5)
-            with pytest.raises(NoReply, match="answers no request"), anyio.fail_after(7.0):
+            with pytest.raises(errors.NoReply, match="answers no request"), anyio.fail_after(7.0):
                 await client.fetch_all()
 
 
@@ -453,14 +441,14 @@ async def test_a_link_that_stays_disconnected_fails_only_calls(caplog: pytest.Lo
         limited = asyncio.create_task(outcome(component.get("PARAM_05", timeout=2)))
         await link.drop(stays_offline=True)
         disconnected_at = anyio.current_time()
-        assert isinstance(await limited, NoReply)
+        assert isinstance(await limited, errors.NoReply)
         for name, task in waiting.items():
             error = await task
-            assert type(error) is LinkError, name
+            assert type(error) is errors.LinkError, name
             assert "refused" in str(error)
             assert math.isclose(anyio.current_time() - disconnected_at, link_task.LINK_TIMEOUT, abs_tol=0.1)
         for call in ("get", "set", "fetch_all", "client.component", "client.fetch_all"):
-            with pytest.raises(LinkError, match="refused"):
+            with pytest.raises(errors.LinkError, match="refused"):
                 await CALLS[call](client, component)
         assert not residue(component)
         await asyncio.sleep(30.0)
@@ -489,12 +477,12 @@ async def test_a_link_that_cannot_reconnect_ends_every_call() -> None:
         await settled()
         await link.drop()
         for name, task in waiting.items():
-            assert type(await task) is LinkError, name
+            assert type(await task) is errors.LinkError, name
         for name, call in CALLS.items():
-            assert type(await outcome(call(client, component))) is LinkError, name
+            assert type(await outcome(call(client, component))) is errors.LinkError, name
         assert "closed" in repr(client)
         assert not residue(component)
-    assert isinstance(await outcome(component.get("PARAM_01")), ClientClosed)
+    assert isinstance(await outcome(component.get("PARAM_01")), errors.ClientClosed)
 
 
 async def test_a_blocked_program_processes_received_data_before_timeouts_count() -> None:

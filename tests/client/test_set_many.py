@@ -10,17 +10,7 @@ from unittest import mock
 import anyio
 import pytest
 
-from paramclient import (
-    CacheError,
-    NoReply,
-    NotDurable,
-    Param,
-    Refused,
-    SetOutcome,
-    SetStatus,
-    UnknownParameter,
-    UsageError,
-)
+from paramclient import Param, SetOutcome, SetStatus, errors
 from paramclient.client.cache_writer import CacheWriter
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire import messages
@@ -52,7 +42,11 @@ async def test_each_value_has_an_outcome_of_its_own() -> None:
             **dict.fromkeys(("NO_SUCH", "PARAM_03", "PARAM_04"), "refused"),
             "COUNT": "adjusted",
         }
-        for name, kind in (("NO_SUCH", UnknownParameter), ("PARAM_03", Refused), ("PARAM_04", UsageError)):
+        for name, kind in (
+            ("NO_SUCH", errors.UnknownParameter),
+            ("PARAM_03", errors.Refused),
+            ("PARAM_04", errors.UsageError),
+        ):
             assert isinstance(result[name].error, kind)
         assert result["COUNT"].requested == 7.6
         assert result["COUNT"].result is not None
@@ -68,7 +62,7 @@ async def test_the_timeout_is_that_of_the_whole_call() -> None:
     async with fetched(tap) as (_, component):
         result = await component.set_many(NEW, timeout=0.25)
         assert 0.2 < result.elapsed < 0.4
-        assert isinstance(result.error, NoReply)
+        assert isinstance(result.error, errors.NoReply)
         assert result.counts[SetStatus.ACCEPTED] >= 10
         assert result.counts[SetStatus.UNKNOWN] >= 10
         assert result.counts[SetStatus.NOT_TRIED] >= 100
@@ -90,9 +84,9 @@ async def test_the_timeout_is_that_of_the_whole_call() -> None:
 async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], message: str) -> None:
     tap = Tap(small_px4())
     async with connected(tap) as (_, component):
-        with pytest.raises(UsageError, match=message):
+        with pytest.raises(errors.UsageError, match=message):
             await component.set_many(values)
-        with pytest.raises(UsageError, match="settle"):
+        with pytest.raises(errors.UsageError, match="settle"):
             await component.set_many({"PARAM_01": 1}, settle=-1)
         assert (await component.set_many({})).is_complete
         await asyncio.sleep(1.0)
@@ -127,16 +121,16 @@ async def test_an_error_of_progress_cancels_the_call() -> None:
 async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Path) -> None:
     async with fetched(small_px4(), cache=tmp_path / "cache") as (_, component):
         assert (await component.set_many({"PARAM_01": 2}, durable=True)).is_complete
-        failing = mock.AsyncMock(side_effect=CacheError("disk I/O error"))
+        failing = mock.AsyncMock(side_effect=errors.CacheError("disk I/O error"))
         with mock.patch.object(CacheWriter, "write_durably", failing):
             result = await component.set_many({"PARAM_01": 3, "NO_SUCH": 1, "PARAM_02": 4}, durable=True)
-        assert isinstance(result.error, NotDurable)
-        assert isinstance(result["PARAM_02"].error, NotDurable)
+        assert isinstance(result.error, errors.NotDurable)
+        assert isinstance(result["PARAM_02"].error, errors.NotDurable)
         assert result["PARAM_02"].status is SetStatus.ACCEPTED
         assert result["PARAM_02"].is_set
-        assert isinstance(result["NO_SUCH"].error, UnknownParameter)
+        assert isinstance(result["NO_SUCH"].error, errors.UnknownParameter)
         assert not result.is_complete
-    with pytest.raises(UsageError, match="durable"):
+    with pytest.raises(errors.UsageError, match="durable"):
         async with a_client(small_px4()) as client:
             await (await client.component()).set_many({"PARAM_01": 2}, durable=True)
 

@@ -10,13 +10,10 @@ import anyio
 import pytest
 
 from paramclient import (
-    CacheError,
-    ClientClosed,
     Component,
     ComponentState,
     Event,
     Events,
-    NoReply,
     ParamCache,
     ParamClient,
     Policy,
@@ -24,7 +21,7 @@ from paramclient import (
     SetStatus,
     SyncState,
     Trust,
-    UsageError,
+    errors,
 )
 from paramclient.model.values import ParamType
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
@@ -146,7 +143,7 @@ async def test_parameters_that_appear_and_go_do_so_in_the_cache_too(path: Path) 
 
 @pytest.mark.parametrize("wrong", [-1, 0.5, float("nan")])
 def test_an_interval_that_cannot_be(wrong: float) -> None:
-    with pytest.raises(UsageError, match="watch_interval"):
+    with pytest.raises(errors.UsageError, match="watch_interval"):
         ParamClient("sim:px4", watch_interval=wrong)
 
 
@@ -168,7 +165,7 @@ async def test_lost_and_found() -> None:
         assert "lost 25 params" in repr(component)
         assert component.params["PARAM_01"].value == 1
         assert {param.trust for param in component.params.values()} == {Trust.CACHED}
-        with anyio.fail_after(3.0), pytest.raises(NoReply):
+        with anyio.fail_after(3.0), pytest.raises(errors.NoReply):
             await component.get("PARAM_01")
         tap.is_mute = tap.is_deaf = False
         with anyio.fail_after(2.0):
@@ -314,7 +311,7 @@ async def test_cache_only_sends_nothing(path: Path) -> None:
         assert {param.trust for param in component.params.values()} == {Trust.CACHED}
         everything = await client.fetch_all()
         assert {at: each.source for at, each in everything.results.items()} == {(1, 1): "cache"}
-        assert isinstance(everything.silent[1, 100], CacheError)
+        assert isinstance(everything.silent[1, 100], errors.CacheError)
         await asyncio.sleep(100.0)
         assert requested(tap) == 0
         assert (await component.get("PARAM_01")).trust is Trust.LIVE, "a name that is requested is read"
@@ -323,9 +320,9 @@ async def test_cache_only_sends_nothing(path: Path) -> None:
 async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
     tap = Tap(Air([small_px4(), generic(component=100)]))
     async with connected(tap, cache=path, policy=Policy.CACHE_ONLY) as (client, component):
-        with pytest.raises(CacheError, match="1/1"):
+        with pytest.raises(errors.CacheError, match="1/1"):
             await component.fetch_all()
-        with pytest.raises(CacheError):
+        with pytest.raises(errors.CacheError):
             await client.fetch_all()
         assert requested(tap) == 0
         assert not residue(component)
@@ -356,13 +353,13 @@ async def test_refresh_is_refused_with_a_policy_that_forbids_downloads(policy: P
     tap = Tap(small_px4())
     async with connected(tap, policy=policy) as (client, component):
         for call in (component.fetch_all(refresh=True), client.fetch_all(refresh=True)):
-            with pytest.raises(UsageError, match=f"policy is {policy}"):
+            with pytest.raises(errors.UsageError, match=f"policy is {policy}"):
                 await call
         assert requested(tap) == 0
 
 
 def test_a_policy_that_does_not_exist() -> None:
-    with pytest.raises(UsageError, match="auto, hash-only, cache-only"):
+    with pytest.raises(errors.UsageError, match="auto, hash-only, cache-only"):
         ParamClient("sim:px4", policy="never")
 
 
@@ -379,9 +376,9 @@ async def test_a_stream_of_events_outlives_a_cancelled_wait_and_has_a_bound_and_
         for number in range(1010):
             events.push(Event(component, "lost", float(number)))
     assert [(await anext(events)).silence for _ in range(1000)] == [*range(10, 1010)], "the newest"
-    assert isinstance(await waiting, ClientClosed)
+    assert isinstance(await waiting, errors.ClientClosed)
     for each in (events, client.events()):
-        with pytest.raises(ClientClosed):
+        with pytest.raises(errors.ClientClosed):
             await anext(each)
 
 
@@ -408,7 +405,7 @@ async def test_a_durable_write_to_a_vehicle_that_does_not_say_who_it_is_is_not_s
         stranger = small_px4(uid=2)
         berth.endpoint = LateVersion(stranger)
         await until(lambda: component.state != "lost")
-        with pytest.raises(CacheError, match="which vehicle"):
+        with pytest.raises(errors.CacheError, match="which vehicle"):
             await component.set("PARAM_01", 1001, durable=True)
         assert stranger.param("PARAM_01").value == 1
 
@@ -490,7 +487,7 @@ async def test_a_vehicle_that_is_lost_ends_set_many(kind: str, delay: float, tmp
 
         async def call() -> None:
             result = await component.set_many(world.wanted, progress=seen.append)
-            assert isinstance(result.error, NoReply)
+            assert isinstance(result.error, errors.NoReply)
             assert sorted(each.name for each in seen) == sorted(world.wanted)
             assert {each.status for each in result.outcomes} == {
                 *(SetStatus.ACCEPTED, SetStatus.UNKNOWN, SetStatus.NOT_TRIED)

@@ -7,16 +7,7 @@ from collections.abc import Callable
 import anyio
 import pytest
 
-from paramclient import (
-    AmbiguousVehicle,
-    Encoding,
-    NoReply,
-    ParamClient,
-    ParamType,
-    UnknownParameter,
-    UsageError,
-    ValueNotApplied,
-)
+from paramclient import Encoding, ParamClient, ParamType, errors
 from paramclient.model.values import encode_value
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
@@ -65,7 +56,7 @@ async def test_any_part_suffices_to_read_and_to_prove_a_set(
             await read(session, "OFFSET")
             assert session.table.params["OFFSET"].value == -7
         if "list" in parts:
-            with pytest.raises(UnknownParameter):
+            with pytest.raises(errors.UnknownParameter):
                 await read(session, "OFFSETS")
 
 
@@ -75,7 +66,10 @@ async def test_any_part_suffices_to_read_and_to_prove_a_set(
 async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(parts: tuple[str, ...]) -> None:
     vehicle = Partial(serves=parts)
     async with talking(vehicle) as (_, session):
-        with pytest.raises(ValueNotApplied, match="1/1 keeps MODE at 5") as caught, anyio.fail_after(15.0):
+        with (
+            pytest.raises(errors.ValueNotApplied, match="1/1 keeps MODE at 5") as caught,
+            anyio.fail_after(15.0),
+        ):
             await write(session, "MODE", 4)
         assert (caught.value.requested, caught.value.actual) == (4, 5)
         assert vehicle.number_of(messages.ParamSet) <= 12
@@ -215,7 +209,7 @@ async def test_a_name_that_an_ardupilot_without_reads_does_not_list_is_unknown(
         table, serves=("list",), first=first, count=lambda index: 2 + too_many, heartbeat=ARDUPILOT
     )
     async with talking(vehicle) as (_, session):
-        with pytest.raises(UnknownParameter, match=r"1/1 has no ABC_DEF; did you mean abc_def"):
+        with pytest.raises(errors.UnknownParameter, match=r"1/1 has no ABC_DEF; did you mean abc_def"):
             await read(session, "ABC_DEF")
         assert (await read(session, "abc_def")).param_id == "abc_def"
         assert anyio.current_time() < 20.0
@@ -225,7 +219,7 @@ async def test_a_name_that_an_ardupilot_without_reads_does_not_list_is_unknown(
 async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(serves: tuple[str, ...]) -> None:
     vehicle = Partial(serves=serves, heartbeat=PX4, count=lambda index: len(TABLE) + 2)
     async with talking(vehicle) as (_, session):
-        with pytest.raises(UnknownParameter) as caught:
+        with pytest.raises(errors.UnknownParameter) as caught:
             await read(session, "NOPE")
         assert "answers no reads" not in str(caught.value)
         assert vehicle.number_of(messages.ParamRequestList) == (serves is not EVERYTHING)
@@ -270,7 +264,7 @@ async def test_integers_in_another_encoding_are_told_and_not_written(
     version = None if capabilities is None else messages.AutopilotVersion(capabilities, uid=7)
     vehicle = Partial(table, heartbeat=heartbeat, encoding=encoding, version=version)
     async with talking(vehicle) as (_, session):
-        with pytest.raises(UsageError, match=rf"was not written.*--encoding {encoding}"):
+        with pytest.raises(errors.UsageError, match=rf"was not written.*--encoding {encoding}"):
             await write(session, name, 9)
         assert (await write(session, "GAIN_1", 2.5)).status == "accepted"
         assert vehicle.number_of(messages.ParamSet) == 1
@@ -320,9 +314,9 @@ async def test_a_component_without_heartbeat_is_found_by_both_ids(
         component = await client.component(1, 240)
         assert (await component.get("MODE")).value == 5
         assert client.autopilots == [client.components[1, 1]]
-        with pytest.raises(NoReply):
+        with pytest.raises(errors.NoReply):
             await client.component(1, 241)
-        with pytest.raises(NoReply):
+        with pytest.raises(errors.NoReply):
             await client.component(component=242)
         writable = await client.only_component(1, 240)
         assert writable is component
@@ -332,7 +326,7 @@ async def test_values_under_another_id_are_named_and_can_be_read() -> None:
     vehicle = Partial(component=50, asked_as=1, heartbeat=None)
     beacon = Puppet(lambda message: ())
     async with ParamClient(Air.symmetric([beacon, vehicle]), cache=False) as client:
-        with pytest.raises(NoReply, match="values came from 1/50"):
+        with pytest.raises(errors.NoReply, match="values came from 1/50"):
             await (await client.component(1, 1)).fetch_all()
     async with ParamClient(Air.symmetric([beacon, vehicle]), cache=False) as client:
         result = await (await client.component(1, 50)).fetch_all()
@@ -352,7 +346,7 @@ async def test_a_component_1_that_claims_no_autopilot_is_the_vehicle_where_no_ot
 
 async def test_a_vehicle_with_system_id_0_is_named_as_that() -> None:
     async with ParamClient(Partial(system=0), cache=False) as client:
-        with pytest.raises(NoReply, match="vehicle with system id 0"):
+        with pytest.raises(errors.NoReply, match="vehicle with system id 0"):
             await client.component(timeout=3.0)
 
 
@@ -371,7 +365,7 @@ async def test_part_of_a_vehicle_is_never_the_vehicle(heartbeat: messages.Heartb
     part = Partial(heartbeat=heartbeat, system=2, component=component)
     async with ParamClient(part, cache=False) as client:
         for choose in (client.component, client.only_component):
-            with pytest.raises(NoReply, match="None is an autopilot"):
+            with pytest.raises(errors.NoReply, match="None is an autopilot"):
                 await choose(timeout=3.0)
         assert (await client.component(2, component)).address == (2, component)
     late = Tap(GenericVehicle({"A": 1}), down=lambda message: anyio.current_time() > 4.0)
@@ -384,5 +378,5 @@ async def test_a_component_with_the_id_0_is_a_component() -> None:
     async with ParamClient(Partial(component=0, asked_as=0), cache=False) as client:
         component = await client.component(1, 0)
         assert (await component.fetch_all()).complete
-        with pytest.raises((NoReply, AmbiguousVehicle)):
+        with pytest.raises((errors.NoReply, errors.AmbiguousVehicle)):
             await client.component(1, 7, timeout=3.0)
