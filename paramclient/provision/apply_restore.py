@@ -125,12 +125,12 @@ def load_restore_point(
     )
     try:
         snapshots = cache.snapshots(key, component, extended=extended)
-        points = [each for each in snapshots if each.reason == BEFORE_APPLY]
-        if not points:
+        point = next((each for each in snapshots[::-1] if each.reason == BEFORE_APPLY), None)
+        if point is None:
             raise missing
-        point, now = points[-1], time.time()
         restores = [each for each in snapshots if each.reason == BEFORE_RESTORE and each.id > point.id]
         if restores:
+            now = time.time()
             ago = age_in_words(now - restores[-1].at)
             raise AlreadyRestored(
                 f"a restore ran {ago} ago, after the last apply ({age_in_words(now - point.at)} ago)",
@@ -140,11 +140,10 @@ def load_restore_point(
             )
         state = cache.state_at(key, component, point.id, extended=extended)
         table = cache.load(key, component, extended=extended)
-        entries = cache.history(key, component, extended=extended)
+        latest = {each.name: each.at for each in cache.history(key, component, extended=extended)}
     except UnknownVehicle:
         raise missing from None
     held = {} if table is None else table.params
-    latest = {entry.name: entry.at for entry in entries}  # of several entries of a name, the last one
     changes = {
         name: at
         for name, at in sorted(latest.items(), key=lambda change: change[1])[::-1]

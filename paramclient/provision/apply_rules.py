@@ -10,7 +10,7 @@ from importlib import resources
 from typing import Any, Final
 
 from paramclient.errors import UsageError
-from paramclient.model.names import NameChoice, is_group_switch
+from paramclient.model.names import NameChoice
 
 READ_ONLY: Final = "read-only"
 """The category of parameters that the vehicle lets no client write."""
@@ -47,16 +47,14 @@ class ApplyRule:
 
 @dataclass(frozen=True, slots=True)
 class ApplyRules:
-    """The entries of `apply_rules.toml` for one autopilot, and its group switches.
+    """The entries of `apply_rules.toml` for one autopilot.
 
     Attributes:
         sections: the entries by section of the file. If several entries of a section match a parameter, the
             first one applies.
-        autopilot: "px4" or "ardupilot"; any other one for both.
     """
 
     sections: Mapping[str, Sequence[ApplyRule]]
-    autopilot: str
 
     def left_out(self, name: str, value_of: Callable[[str], object] = lambda _: None) -> ApplyRule | None:
         """Return the entry that leaves a parameter out by default, or None.
@@ -79,10 +77,6 @@ class ApplyRules:
         last), and `system_id`.
         """
         return any(rule.names.has(name) for rule in self.sections[section])
-
-    def reveals(self, name: str) -> bool:
-        """Return whether a change of the parameter may show or hide other parameters."""
-        return is_group_switch(name, self.autopilot)
 
     def needs_reboot(self, name: str, vehicle_type: int | None = None) -> bool:
         """Return whether the parameter is listed as one that takes effect after a reboot.
@@ -144,6 +138,5 @@ def rules_for(autopilot: str, *, is_extended: bool = False) -> ApplyRules:
                 if entry["autopilot"] in fitting
             ]
             for section, found in entries.items()
-        },
-        autopilot,
+        }
     )

@@ -407,12 +407,9 @@ class _Run:
             raise
         finally:
             self._written_at = anyio.current_time()
-        not_tried = [each for each in done.outcomes if each.status is SetStatus.NOT_TRIED]
-        self.sent -= {outcome.name for outcome in not_tried} - before
+        self.sent -= {each.name for each in done.outcomes if each.status is SetStatus.NOT_TRIED} - before
         if done.error is not None:
             raise done.error
-        for outcome in not_tried:
-            self._settle(by_name[outcome.name], ApplyStatus.NOT_TRIED, str(outcome.error))
 
     def _take(self, row: ApplyRow, outcome: SetOutcome) -> None:
         """Record the outcome of a write."""

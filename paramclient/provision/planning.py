@@ -17,7 +17,7 @@ from paramclient.errors import UsageError
 from paramclient.metadata import ParamInfo
 from paramclient.model.comparison import same_value
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
-from paramclient.model.names import nearest_names
+from paramclient.model.names import is_group_switch, nearest_names
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, Value, format_value
 from paramclient.protocol.dialect import EXTENDED, PLAIN
@@ -396,7 +396,7 @@ class _Planner:
             return _LAST
         if self.rules.has("frame", row.name):
             return _FRAME
-        if not self.rules.reveals(row.name):
+        if not is_group_switch(row.name, self.autopilot):
             return _OTHERS
         return _TURNED_OFF if row.wanted.settable == 0 else _SWITCHES
 
@@ -409,7 +409,7 @@ class _Planner:
             if row.status is ApplyStatus.UNCHANGED
             and row.before != 0
             and row.needs_reboot
-            and (self.rules.reveals(name) or self.rules.has("frame", name))
+            and (is_group_switch(name, self.autopilot) or self.rules.has("frame", name))
             and any(each.startswith(_group_of(name)) for each in missing)
         )
 
@@ -434,7 +434,7 @@ class _Planner:
         """
         groups: list[str] = []
         for name, row in rows.items():
-            is_switch = self.rules.reveals(name)
+            is_switch = is_group_switch(name, self.autopilot)
             is_off = is_switch and row.wanted.settable == 0
             if row.status is not ApplyStatus.SET or is_off or self.rules.has("last", name):
                 continue

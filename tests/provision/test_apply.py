@@ -200,17 +200,6 @@ async def test_a_refused_or_adjusted_value_does_not_stop_the_others() -> None:
     assert statuses(again) == dict.fromkeys(SETTINGS, "unchanged") | refused | {"TUNE_01": "refused"}
 
 
-async def test_left_out_parameters_can_be_included() -> None:
-    wanted = {"COMPASS_OFS_X": 7.0, "STAT_RUNTIME": 9}
-    async with a_client(ardupilot()) as client:
-        component = await client.component()
-        result = await apply(component, wanted, include="calibration")
-        assert statuses(result) == {"COMPASS_OFS_X": "accepted", "STAT_RUNTIME": "skipped"}
-        assert result.complete
-        assert (await plan(component, wanted, include="calibration")).complete
-        assert not (await plan(component, wanted, include=["STAT_*"])).complete
-
-
 async def test_the_state_is_stored_before_anything_is_sent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
