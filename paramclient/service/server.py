@@ -31,6 +31,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from paramclient.client.signing import read_private
 from paramclient.errors import LinkError, UsageError
+from paramclient.protocol.channel import task_group
 from paramclient.service import routes
 from paramclient.service.hub import Hub
 from paramclient.service.problems import ERRORS, RESPONSES, ServiceError, problem_response, respond
@@ -320,7 +321,7 @@ async def serve(
         listens: called with the URL as soon as the service accepts connections.
 
     Raises:
-        LinkError: the address cannot be listened on.
+        LinkError: the address cannot be listened on, or an endpoint for ground stations.
         UsageError: the address is invalid, or other computers could connect without tokens.
     """
     config = uvicorn.Config(
@@ -338,7 +339,7 @@ async def serve(
     server = _Server(config)
     opened, url = listen_at(address, is_protected=tokens is not None)
     with opened:
-        async with anyio.create_task_group() as tasks:
+        async with task_group() as tasks:
             try:
                 async with hub:
                     tasks.start_soon(server.serve, [opened])

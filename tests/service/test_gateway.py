@@ -21,7 +21,7 @@ import fastcrc
 import pytest
 
 from paramclient import ParamType
-from paramclient.errors import LinkError, UsageError
+from paramclient.errors import UsageError
 from paramclient.links import create_link, serve_endpoint, sockets
 from paramclient.model.values import Encoding, encode_value
 from paramclient.protocol.ftp import Opcode, Packet
@@ -973,16 +973,6 @@ async def test_the_command_and_the_client_work_through_the_gateway() -> None:
             assert (await component.set("PARAM_01", 34)).status == "accepted"
         assert len(vehicle.messages(ParamSet)) == 2
         assert not vehicle.messages(ParamRequestList)
-
-
-def test_an_endpoint_that_is_in_use_ends_the_start() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as other, pytest.raises(LinkError, match="in use"):
-        anyio.run(_start, f"tcpin:{other.getsockname()[1]}")
-
-
-async def _start(endpoint: str) -> None:
-    async with Hub([small_px4()], cache=False, mavlink=[endpoint]):
-        raise AssertionError("it was opened")
 
 
 # faults

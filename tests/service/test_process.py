@@ -91,17 +91,24 @@ async def test_it_wants_a_token_of_its_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("code", "words", "said"),
     [
-        (["sim:px4", "--listen", "0.0.0.0:0"], "--tokens"),
-        (["sim:px4", "--tokens", "no-such-file"], "no-such-file"),
-        (["sim:px4", "--cache", "a", "--no-cache"], "exclude"),
-        (["sim:px4", "sim:px4"], "twice"),
-        ([], "link"),
+        (2, ["sim:px4", "--listen", "0.0.0.0:0"], "--tokens"),
+        (2, ["sim:px4", "--tokens", "no-such-file"], "no-such-file"),
+        (2, ["sim:px4", "--cache", "a", "--no-cache"], "exclude"),
+        (2, ["sim:px4", "sim:px4"], "twice"),
+        (2, [], "link"),
+        (
+            4,
+            ["sim:px4", "--listen", "127.0.0.1:0", "--mavlink", "tcpin:192.0.2.1:5760"],
+            "tcpin:192.0.2.1:5760",
+        ),
     ],
 )
-def test_wrong_arguments_are_refused(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_start_that_fails(
+    code: int, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     options = [] if {"--cache", "--no-cache"} & set(words) else ["--no-cache"]
     ended = in_process(capsys)("serve", *words, *options)
-    assert (ended.code, ended.out) == (2, "")
+    assert (ended.code, ended.out) == (code, "")
     assert said in ended.err
