@@ -36,7 +36,7 @@ def flight_controller() -> Iterator[str]:
     is_over = threading.Event()
 
     def fly() -> None:
-        vehicle = PX4Vehicle()
+        vehicle = PX4Vehicle(stream=True)
         waiting = b""
         while not is_over.wait(PORTION / BYTES_A_SECOND):
             now = time.monotonic()

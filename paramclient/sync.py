@@ -13,8 +13,6 @@ The functions have the arguments and the results of those in `paramclient.provis
 `tests/sync_stub.py` writes the types into `sync.pyi` (`make sync`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -37,9 +35,7 @@ __all__ = [
     "restore",
 ]
 
-plan = blocking(provision.plan)
-apply = blocking(provision.apply)
-restore = blocking(provision.restore)
+plan, apply, restore = map(blocking, (provision.plan, provision.apply, provision.restore))
 metadata_of = blocking(metadata.metadata_of)
 
 
