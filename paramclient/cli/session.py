@@ -40,6 +40,9 @@ RECHECK_TIMEOUT: Final = 2.5
 was lost in between."""
 AWAITED_NAMES_MAX: Final = 3
 """Parameters that the line about awaited values names."""
+OTHERS_TIMEOUT: Final = 2.5
+"""Seconds in which a camera or another component beside an autopilot must give its first parameter, to be
+one of all."""
 FIRMWARE_TIMEOUT: Final = 0.5
 """Seconds to wait for the firmware version of the vehicle, to name it to the user or to find its metadata."""
 
@@ -337,6 +340,8 @@ async def sessions(
         if choice.is_all:
             with _waiting(client, "vehicles"):
                 found = await client.find_autopilots(timeout=deadline.heartbeat_timeout)
+            if not writes:
+                found += await _others_with_parameters(client)
         else:
             found = [await wait_for_vehicle(client, choice, deadline, only=writes)]
         if writes:
@@ -364,6 +369,27 @@ def _client(url: str, options: TrafficOptions, **more: Any) -> ParamClient:
 
 
 # Vehicles
+
+
+async def _others_with_parameters(client: ParamClient) -> list[Component]:
+    """Return the components beside the autopilots that have parameters, and print a line for each other."""
+    others = [each for each in client.components.values() if each.node.identification.has_parameters]
+    others = [each for each in others if each not in client.autopilots]
+
+    async def ask(component: Component) -> None:
+        try:
+            await component.get(0, timeout=OTHERS_TIMEOUT)
+        except NoReply:
+            what = f"{node_in_words(component.node)} has no parameters, or none within {OTHERS_TIMEOUT:g} s"
+            say(f"{what}; --extended uses extended ones")
+        except UnknownParameter:
+            pass
+
+    if not client.listens_only:
+        async with anyio.create_task_group() as tasks:
+            for each in others:
+                tasks.start_soon(ask, each)
+    return [each for each in others if each.count is not None]
 
 
 async def wait_for_vehicle(

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from paramclient import read_file
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, Camera, PX4Vehicle
 from tests.commands import Command, Put, strict
 from tests.shell import Tap
 
@@ -114,6 +114,19 @@ def test_get_and_fetch_read_every_vehicle(command: Command, put: Put) -> None:
     fetched = command("fetch", url, "A", "--vehicle", "all")
     assert [line[:3] for line in fetched.words[1:]] == [["1/1", "A", "1.0"], ["4/1", "A", "1.0"]]
     assert len(re.findall(r" bytes received, [0-9,]+ sent on the whole link", fetched.err)) == 2
+
+
+def test_all_reads_other_components_that_have_parameters_and_names_those_without(
+    command: Command, put: Put
+) -> None:
+    cameras = [Camera(component=100), Camera(component=101, plain={"ZOOM": 2})]
+    url = put(Air([px4(), *cameras]))
+    fetched = command("fetch", url, "--vehicle", "all")
+    assert fetched.code == 0, fetched.err
+    assert [line[:2] for line in fetched.words[1:]] == [["1/1", "A"], ["1/1", "B"], ["1/101", "ZOOM"]]
+    assert "1/100 camera has no parameters, or none within 2.5 s" in fetched.err
+    assert command("set", url, "ZOOM", 3, "--vehicle", "all").code == 2
+    assert not cameras[1].requests["PARAM_SET"]
 
 
 def test_one_vehicle_that_fails_stops_no_other(command: Command, put: Put) -> None:
