@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -45,7 +45,7 @@ from paramclient.model.comparison import non_defaults
 from paramclient.model.identity import autopilot_name, has_autopilot
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import time_text
-from paramclient.model.paramset import ParamSet, add_defaults
+from paramclient.model.paramset import Default, ParamSet, add_defaults
 from paramclient.model.values import check_name, format_value
 from paramclient.provision.sources import link_of, read_source, resolve, tables_in
 
@@ -89,59 +89,45 @@ async def show(
         sets = [await resolve(vehicle, cache=False)] if found is None else found.sets
     everything = {name for each in sets for name in each}
     kept = NameChoice(chosen).choose(everything) if chosen else everything
-    views = [
-        _View(replace(params, params={name: params[name] for name in params if name in kept}), known, changed)
-        for params, known in zip(sets, known_of_sets(sets, options, metadata), strict=True)
-    ]
-    if changed and not any(view.defaults for view in views):
+    views = []
+    for params, info in zip(sets, known_of_sets(sets, options, metadata), strict=True):
+        part = {name: param for name, param in params.items() if name in kept}
+        found_defaults = {name: default_in(info, param) for name, param in part.items()}
+        defaults = {name: default for name, default in found_defaults.items() if default is not None}
+        values = {name: default.value for name, default in defaults.items()}
+        shown = add_defaults(replace(params, params=part), values)
+        views.append((non_defaults(shown) if changed else shown, info, defaults))
+    if changed and not any(defaults for _, _, defaults in views):
         report(no_defaults())
         return ExitCode.INCOMPLETE
+    items = [_json(*view, is_chosen=bool(chosen)) for view in views]
     if options.json:
-        print_json({"components": [view.as_json(is_chosen=bool(chosen)) for view in views]})
+        print_json({"components": items})
         return ExitCode.DONE
-    for view in views:
-        view.print(is_chosen=bool(chosen))
+    for (shown, info, defaults), item in zip(views, items, strict=True):
+        columns = ("name", "value", "default", "type", "meaning", "units", "comment")
+        members = ("value", "default", "type", "text", "units", "comment")
+        print_table(columns, cells_of(item["params"], *members))
+        if chosen and info is not None:
+            for name in shown:
+                _print_description(name, info.find(name))
+        say(described(shown) + (", those that differ from their default" if changed else ""))
+        if changed:
+            say_sources(address(shown), [defaults[name] for name in shown])
     return ExitCode.DONE
 
 
-class _View:
-    """The parameters of a set that are shown.
-
-    Args:
-        params: the set.
-        metadata: its metadata, or None.
-        is_changed: whether only parameters that differ from the defaults are shown.
-    """
-
-    def __init__(self, params: ParamSet, metadata: Metadata | None, is_changed: bool) -> None:
-        self._metadata, self._is_changed = metadata, is_changed
-        found = {name: default_in(metadata, param) for name, param in params.items()}
-        self.defaults = {name: default for name, default in found.items() if default is not None}
-        self._shown = add_defaults(params, {name: each.value for name, each in self.defaults.items()})
-        if is_changed:
-            self._shown = non_defaults(self._shown)
-
-    def as_json(self, *, is_chosen: bool) -> JsonObject:
-        """Return the JSON of the set; of chosen parameters with their metadata."""
-        shown = set_json(self._shown, {name: default.source for name, default in self.defaults.items()})
-        for name, param in shown["params"].items():
-            if (info := info_of(self._metadata, name)) is not None:
-                text, units = info.text(self._shown[name].settable), info.units
-                param |= known_members(text=text or None, units=units or None)
-                param |= {"metadata": info_json(info)} if is_chosen else {}
-        return shown
-
-    def print(self, *, is_chosen: bool) -> None:
-        """Print the table, the descriptions of chosen parameters, and a line about the set on stderr."""
-        columns = ("name", "value", "default", "type", "meaning", "units", "comment")
-        members = ("value", "default", "type", "text", "units", "comment")
-        print_table(columns, cells_of(self.as_json(is_chosen=is_chosen)["params"], *members))
-        if is_chosen and self._metadata is not None:
-            for name in self._shown:
-                _print_description(name, self._metadata.find(name))
-        say(described(self._shown) + (", those that differ from their default" if self._is_changed else ""))
-        if self._is_changed:
-            say_sources(address(self._shown), [self.defaults[name] for name in self._shown])
+def _json(
+    shown: ParamSet, metadata: Metadata | None, defaults: Mapping[str, Default], *, is_chosen: bool
+) -> JsonObject:
+    """Return the JSON of a set; of chosen parameters with all their metadata."""
+    found = set_json(shown, {name: default.source for name, default in defaults.items()})
+    for name, param in found["params"].items():
+        if (info := info_of(metadata, name)) is not None:
+            text, units = info.text(shown[name].settable), info.units
+            param |= known_members(text=text or None, units=units or None)
+            param |= {"metadata": info_json(info)} if is_chosen else {}
+    return found
 
 
 def search(
