@@ -36,7 +36,6 @@ from paramclient.errors import CacheError, FileError, NoReply, NotInCache, Unkno
 from paramclient.files import FileFormat, ParamFile
 from paramclient.model.names import age_in_words, first_of
 from paramclient.model.paramset import ParamSet
-from paramclient.protocol.fetch import Progress
 from paramclient.provision import (
     CATEGORIES,
     ApplyOptions,
@@ -321,7 +320,6 @@ class _Job:
         is_restore: whether the values are an earlier state of the vehicle.
         plan: the plan, until the writes begin.
         arrived: the outcomes so far.
-        began: when the writes began, as a time of the event loop.
         result: the result at the end.
     """
 
@@ -333,7 +331,6 @@ class _Job:
     is_restore: bool
     plan: Plan | None = None
     arrived: dict[str, ApplyRow] = field(default_factory=dict)
-    began: float = 0.0
     result: ApplyResult | None = None
 
     async def make_plan(self) -> Self:
@@ -356,12 +353,11 @@ class _Job:
         def update(now: ApplyProgress) -> None:
             if now.row is not None:
                 self.arrived[now.row.name] = now.row
-                status.update(Progress.after(now.done, now.total, anyio.current_time() - self.began))
+                status.count(now.done, now.total)
 
         async def announce() -> None:
             await session.check_only()
             session.announce_write()
-            self.began = anyio.current_time()
 
         self.plan = None
         title = f"{'restoring' if self.is_restore else 'setting'} {session.label}"

@@ -32,7 +32,6 @@ from paramclient.metadata.store import AddedFiles
 from paramclient.model.names import counted
 from paramclient.model.paramset import Default, DefaultSource, ParamSet, WrittenParam, default_of
 from paramclient.model.values import Param
-from paramclient.protocol.fetch import Progress
 
 VEHICLE: Final = "vehicle"
 """The value of --metadata that downloads the metadata from the vehicle."""
@@ -109,13 +108,9 @@ async def request_from_vehicle(session: CommandSession) -> Metadata | None:
     Raises:
         UsageError, VehicleError, NoReply, LinkError: as `metadata_of`.
     """
-    what, began = f"the parameter metadata of {session.label}", anyio.current_time()
+    what = f"the parameter metadata of {session.label}"
     with Status(f"waiting for {what}", f"downloading {what}, bytes:") as status:
-
-        def progress(received: int, size: int | None) -> None:
-            status.update(Progress.after(received, size, anyio.current_time() - began))
-
-        return await metadata_of(session.component, timeout=session.deadline.left(), progress=progress)
+        return await metadata_of(session.component, timeout=session.deadline.left(), progress=status.count)
 
 
 async def _stored(session: CommandSession, *, added_only: bool = False) -> Metadata | None:

@@ -258,6 +258,7 @@ class Status:
     def __init__(self, awaited: str, title: str = "", heard: Callable[[], str] = lambda: "") -> None:
         self._awaited, self._title, self._heard = awaited, title, heard
         self._progress: Progress | None = None
+        self._counts_since: float | None = None
 
     def __enter__(self) -> Self:
         if sys.stderr.isatty():
@@ -279,6 +280,13 @@ class Status:
             self._progress = progress
             if self._loop.time() - (Status._drawn_at or 0.0) >= DRAW_INTERVAL:
                 self._draw()
+
+    def count(self, received: int, total: int | None) -> None:
+        """Show a progress by its count, with the rate since the first one."""
+        if self in self._active:
+            now = self._loop.time()
+            self._counts_since = self._counts_since or now
+            self.update(Progress.after(received, total, now - self._counts_since))
 
     @classmethod
     def erase(cls) -> None:

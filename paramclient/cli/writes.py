@@ -18,7 +18,6 @@ from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.names import counted, first_of
 from paramclient.model.values import ParamType, Value
-from paramclient.protocol.fetch import Progress
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 
 STYLES: Final = {
@@ -107,8 +106,7 @@ class SetJob:
                 is_announced = True
                 session.announce_write()
             self.arrived[outcome.name] = outcome
-            elapsed = anyio.current_time() - self.began
-            status.update(Progress.after(len(self.arrived), len(self.writes), elapsed))
+            status.count(len(self.arrived), len(self.writes))
 
         with Status(f"waiting for {label} to acknowledge PARAM_SET", f"setting {label}") as status:
             try:
