@@ -186,11 +186,10 @@ async def for_each(
     errors: dict[tuple[int, int], ParamClientError] = {}
 
     async def run(component: Component) -> None:
-        address = component.system, component.component
         try:
-            results[address] = await call(component)
+            results[component.address] = await call(component)
         except ParamClientError as error:
-            errors[address] = error
+            errors[component.address] = error
 
     async with anyio.create_task_group() as running:
         for component in components:

@@ -64,10 +64,8 @@ class ApplyRules:
             value_of: returns the value of another parameter, or the value it is to get; by default no other
                 parameter has a value.
         """
-        for rule in self.sections["left_out"]:
-            if rule.names.has(name) and all(value_of(other) != value for other, value in rule.unless.items()):
-                return rule
-        return None
+        rules = (rule for rule in self.sections["left_out"] if rule.names.has(name))
+        return next((each for each in rules if all(value_of(n) != v for n, v in each.unless.items())), None)
 
     def has(self, section: str, name: str) -> bool:
         """Return whether a section has a parameter.

@@ -30,14 +30,7 @@ from paramclient.files import write_file
 from paramclient.model.paramset import ParamSet
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, ApplyRules, rules_for
-from paramclient.provision.inspection import (
-    POLL_INTERVAL,
-    Inspection,
-    inspect,
-    plan_for,
-    reread,
-    wait_for_identity,
-)
+from paramclient.provision.inspection import Inspection, inspect, plan_for, reread, wait_for_identity
 from paramclient.provision.planning import WRONG, ApplyRow, ApplyStatus, Plan, PlanOptions, Rows, Stage
 
 BEFORE_APPLY: Final = "before apply"
@@ -52,6 +45,8 @@ another parameter may have changed it."""
 VERIFY_DELAY: Final = 1.2
 """Seconds between the last write and the read that verifies it: modules of PX4 clamp the value, or set other
 parameters, up to 1.1 s after the acknowledgement (measured)."""
+POLL_INTERVAL: Final = 0.05
+"""Seconds between two looks at the armed state, for which there is no event."""
 ARMED_STATE_TIMEOUT: Final = 3.0
 """Seconds to wait for a heartbeat with the armed flag: heartbeats arrive once a second, and some are lost."""
 SYSTEM_CHANGE_TIMEOUT: Final = 5.0
@@ -163,7 +158,6 @@ async def run(
             with component.watch.held():  # a changed count starts no download besides those of the run
                 await one.store_state()
                 await one.write_and_verify()
-            await one.record_end()
         except ParamClientError as failure:
             if not one.sent:
                 raise
@@ -258,15 +252,8 @@ class _Run:
             ) from error
         self._snapshot = snapshot.id
 
-    async def record_end(self) -> None:
-        """Record in the cache that the run was not interrupted."""
-        number, cache = self._snapshot, self.component.core.cache
-        if cache is not None and number is not None:
-            with suppress(CacheError):  # the warning of the cache writer says so
-                await self.component.core.cache_writer.run_in_thread(lambda: cache.end_operation(number))
-
     async def write_and_verify(self) -> None:
-        """Write and verify until no stage is pending.
+        """Write and verify until no stage is pending; record in the cache that the run was not interrupted.
 
         Raises:
             ParamClientError: the run ended early; `result` has the outcomes so far.
@@ -287,6 +274,10 @@ class _Run:
                 break
         if self.options.get("durable") and self.sent:
             await self.component.core.cache_writer.write_durably(self.component.node)
+        number, cache = self._snapshot, self.component.core.cache
+        if cache is not None and number is not None:
+            with suppress(CacheError):  # the warning of the cache writer says so
+                await self.component.core.cache_writer.run_in_thread(lambda: cache.end_operation(number))
 
     def result(self, error: ParamClientError | None, elapsed: float) -> ApplyResult:
         """Return the result of the run."""
@@ -427,8 +418,7 @@ class _Run:
 
     async def _write_system_id(self, row: ApplyRow) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
-        component, name, system = self.component, row.name, int(row.wanted.value)
-        own = component.identity
+        component, own, system = self.component, self.component.identity, int(row.wanted.value)
         for known in component.client.components.values():
             is_ours = own.has_own_uid and known.identity.uid == own.uid  # under an earlier id
             is_there = known.system == system != component.system and known.state != "lost"
@@ -439,12 +429,12 @@ class _Run:
         if row.needs_reboot:
             await self._write([row])
             return
-        self.sent.add(name)
+        self.sent.add(row.name)
         self._written_at, is_acknowledged = math.inf, False
         try:
             with suppress(NoReply):  # it may have its new id before it acknowledges
                 await component.set(
-                    name, system, timeout=SYSTEM_CHANGE_TIMEOUT, author=self.options.get("author")
+                    row.name, system, timeout=SYSTEM_CHANGE_TIMEOUT, author=self.options.get("author")
                 )
                 is_acknowledged = True
             self.component = await component.client.successor(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Iterable, Iterator, Mapping
+from collections.abc import Collection, Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, TypeAlias, Unpack
 
@@ -20,8 +20,6 @@ READS_IN_PROGRESS_MAX: Final = 64
 IDENTITY_TIMEOUT: Final = 10.0
 """Seconds to wait for the identity of a vehicle. The identification usually ends sooner, after a few
 requests."""
-POLL_INTERVAL: Final = 0.05
-"""Seconds between two checks of a state for which there is no event, such as the identity."""
 READ_OVERHEAD: Final = 0.5
 """Seconds that a group of reads by name takes in addition to the time per read."""
 READ_INTERVAL: Final = 0.025
@@ -133,8 +131,7 @@ async def inspect(
     before = {name for name, param in component.params.items() if param.trust is Trust.LIVE}
     fetched = await component.fetch_all()
     if component.node.channel.is_lost:
-        subject = f"the parameters of {component.system}/{component.component}"
-        raise NoReply(subject, attempts=0, waited=fetched.elapsed)
+        raise NoReply(f"the parameters of {component.node.channel}", attempts=0, waited=fetched.elapsed)
     if doubt := component.session.encoding_doubt:
         raise UsageError(doubt)
     params = dict(component.params)
@@ -180,8 +177,8 @@ async def reread(
     began = anyio.current_time()
     found, unknown = await _read_names(component, names, given_up)
     if given_up and not found:
-        subject = f"the values of {component.system}/{component.component}"
-        raise NoReply(subject, attempts=0, waited=anyio.current_time() - began)
+        waited = anyio.current_time() - began
+        raise NoReply(f"the values of {component.node.channel}", attempts=0, waited=waited)
     known = (inspection.table.keys() | found.keys()) - unknown
     params = (param for name, param in component.params.items() if name in known)
     return replace(
@@ -237,10 +234,5 @@ def _in_no_hidden_group(table: Mapping[str, Param], wanted: Iterable[str]) -> fr
         wanted: the wanted names.
     """
     switches = [name for name, param in table.items() if param.type is ParamType.INT8 and param.settable == 0]
-    hidden = tuple({start for name in switches for start in _group_prefixes(name)})
+    hidden = tuple({name[:at] for name in switches for at in range(1, len(name)) if name[at] == "_"})
     return frozenset(name for name in wanted if name not in table and not name.startswith(hidden))
-
-
-def _group_prefixes(switch: str) -> Iterator[str]:
-    """Return the prefixes that the names of a switch's group may have: its name up to each underscore."""
-    return (switch[:at] for at, letter in enumerate(switch) if letter == "_" and at > 0)

@@ -449,9 +449,8 @@ class _Planner:
     ) -> tuple[str, str] | None:
         """Return why a value is invalid, as category and sentence, or None."""
         value, info = target.settable, self.described.get(target.name)
-        if self.rules.has("system_id", target.name) and (
-            isinstance(value, bytes | str) or not 1 <= value <= 255
-        ):
+        is_system_id = not isinstance(value, bytes | str) and 1 <= value <= 255
+        if self.rules.has("system_id", target.name) and not is_system_id:
             return WRONG, "a system id is a number from 1 to 255"
         if kind is not None:
             try:

@@ -34,9 +34,8 @@ STANDARD_INPUT: Final = "-"
 NAMES_SHOWN_MAX: Final = 20
 """Parameters that a message names, so that it stays readable; it gives the number of further ones."""
 NO_DEFAULTS: Final = (
-    "the firmware's defaults are not known, so the parameters that differ from them cannot be found: they "
-    "come with the parameter file over MAVFTP, which ArduPilot and PX4 from 1.18 on serve, or with the "
-    "metadata of the firmware"
+    "the firmware's defaults are not known: they come with the parameter file over MAVFTP, which ArduPilot "
+    "and PX4 from 1.18 on serve, or with the metadata of the firmware"
 )
 """The message for a request that needs the firmware's defaults when no parameter has one."""
 _CACHED: Final = "cache:"
