@@ -239,7 +239,8 @@ class _Download:
         missing = self._gaps()
         if missing and now - self._gained_at < QUEUE_TIME:
             return False
-        given_up = sum(map(self._is_given_up, missing))
+        attempts_max = self._attempts_max()  # once, where a false count makes thousands of gaps
+        given_up = sum(self._tried.get(index, 0) >= attempts_max for index in missing)
         is_fruitless = self.table.is_growing or given_up >= self.channel.window_size
         return given_up == len(missing) or (is_fruitless and now - self._last >= UNANSWERED_MAX)
 

@@ -17,7 +17,7 @@ from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.identity import judge_encoding
 from paramclient.protocol.presence import BOOT_CLOCK_WRAP, LOST_AFTER_HIGH_LATENCY, REORDERING_TIME, Presence
 from paramclient.protocol.reads import read
-from paramclient.protocol.selection import find, only_vehicle
+from paramclient.protocol.selection import find, hint_of_link, only_vehicle
 from paramclient.protocol.watch import Watch
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
@@ -470,3 +470,13 @@ async def test_a_signed_session_takes_no_forged_and_no_replayed_value(make: type
         assert report.refused.keys() == {Refusal.UNSIGNED}
         assert vehicle.signing_report is not None
         assert not vehicle.signing_report.refused
+
+
+async def test_hints_tell_a_link_that_is_down_from_one_without_heartbeats() -> None:
+    async with converse(Nothing()) as conversation:
+        conversation.hear(messages.StatusText(6, "x"), system=9)
+        assert (
+            hint_of_link(conversation.station, 60) == "1 MAVLink frame arrived on sim:test, but no heartbeat."
+        )
+        conversation.station.interrupt()
+        assert hint_of_link(conversation.station, 60) == "sim:test is down at present."
