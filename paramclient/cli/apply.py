@@ -36,21 +36,12 @@ from paramclient.errors import CacheError, FileError, NoReply, NotInCache, Unkno
 from paramclient.files import FileFormat, ParamFile
 from paramclient.model.names import age_in_words, first_of
 from paramclient.model.paramset import ParamSet
-from paramclient.provision import (
-    CATEGORIES,
-    ApplyOptions,
-    ApplyProgress,
-    ApplyResult,
-    ApplyRow,
-    ApplyStatus,
-    Plan,
-    plan,
-)
 from paramclient.provision.apply_restore import load_restore_point, restore_categories
-from paramclient.provision.apply_rules import READ_ONLY
+from paramclient.provision.apply_rules import CATEGORIES, READ_ONLY
+from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
 from paramclient.provision.execution import run as run_apply
-from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.planning import Rows
+from paramclient.provision.inspection import plan, wait_for_identity
+from paramclient.provision.planning import ApplyRow, ApplyStatus, Plan, Rows
 from paramclient.provision.sources import choose, is_file, read_source
 
 _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be revealed"}

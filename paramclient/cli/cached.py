@@ -15,7 +15,7 @@ from typing import Final
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache, SnapshotSummary
 from paramclient.cli.json_output import history_json, known_members, snapshot_json, taken
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import ExitCode, code_of, local_time, print_json, print_line, report, say, show
+from paramclient.cli.output import ExitCode, local_time, print_json, print_line, report, report_all, say, show
 from paramclient.cli.session import check_given
 from paramclient.errors import FileError, LinkError, ParamClientError, UsageError
 from paramclient.files.conversion import kind_of
@@ -137,7 +137,7 @@ def load_tables(
 # import
 
 
-async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS) -> ExitCode:
+async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS) -> int:
     """Import logs into the cache: vehicles, tables and changes, with the times of the logs.
 
     Later values in the cache are kept, so neither order nor repetition matters. All files are tried even if
@@ -147,14 +147,13 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
         file: A telemetry log (.tlog), or an on-board log of ArduPilot (.bin) or PX4 (.ulg).
         files: Further logs.
     """
-    code, found = ExitCode.DONE, []
+    code, found = 0, []
     with ParamCache(options.cache) as cache:
         for each in (file, *files):
             try:
                 tables = await _import(each, cache)
             except ParamClientError as error:
-                report(str(error))
-                code = max(code, code_of(error))
+                code = max(code, report_all([error]))
                 continue
             for table in tables:
                 autopilot = None if table.autopilot is None else autopilot_name(table.autopilot)

@@ -11,9 +11,9 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient.cli.json_output import taken
-from paramclient.cli.metadata import METADATA_HINT, MetadataFile, defaults_in, known_of_sets, say_sources
+from paramclient.cli.metadata import MetadataFile, defaults_in, known_of_sets, no_defaults, say_sources
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import ExitCode, print_json, report, say
+from paramclient.cli.output import LINE_NAMES_MAX, ExitCode, print_json, report, say
 from paramclient.cli.session import ChosenVehicle, sessions
 from paramclient.cli.sources import check_link, filled, noun_of, part_of, whole_table, without_cache
 from paramclient.errors import UsageError, VehicleError
@@ -22,15 +22,7 @@ from paramclient.files.formats import address, format_of_name
 from paramclient.metadata import Metadata
 from paramclient.model.names import NameChoice, counted, first_of
 from paramclient.model.paramset import ParamSet, default_of
-from paramclient.provision.sources import (
-    NAMES_SHOWN_MAX,
-    NO_DEFAULTS,
-    choose,
-    is_offline,
-    link_of,
-    read_source,
-    select_non_defaults,
-)
+from paramclient.provision.sources import choose, is_offline, link_of, read_source, select_non_defaults
 
 _DEFAULTS: Final = LinkOptions()
 
@@ -88,7 +80,7 @@ async def save(
         path = Path(filled(str(file), each.system, uid, address(each)))
         kept, left_out = writable(each, written)
         if left_out:
-            listed = first_of(left_out, NAMES_SHOWN_MAX)
+            listed = first_of(left_out, LINE_NAMES_MAX)
             report(f"{address(each)}: left out, as only a .json file can hold them: {listed}")
         files.setdefault(path, []).append(kept)
     for path, of_file in files.items():
@@ -130,8 +122,7 @@ def _differing(whole: ParamSet, metadata: Metadata | None) -> ParamSet | None:
     try:
         differing = select_non_defaults(whole, described)
     except UsageError as error:
-        hint = f"; {METADATA_HINT}" if str(error) == NO_DEFAULTS else ""
-        report(f"{address(whole)}: {error}{hint}")
+        report(f"{address(whole)}: {no_defaults() if str(error) in no_defaults() else error}")
         return None
     say_sources(address(whole), (default_of(each, described.get(each.name)) for each in differing.values()))
     return differing
