@@ -111,8 +111,6 @@ def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
     assert unknown.code == 2
     stores = "`paramclient fetch LINK --metadata vehicle` requests metadata from a vehicle that serves it"
     assert stores in unknown.err
-    for others in (("show", "1", "--changed"), ("show", file, "--changed")):
-        assert stores in command(*others).err
     assert stores in command("save", "1", tmp_path / "none.parm", "--changed").err
     assert command("fetch", put(quad()), "--metadata", "vehicle").code == 0
     found = command(*words, "--json").json

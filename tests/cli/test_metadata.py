@@ -84,18 +84,6 @@ def test_nothing_is_sent_with_a_wrong_name(command: Command, put: Put, words: li
     assert not vehicle.requests
 
 
-def test_a_value_outside_of_the_range_is_sent_with_force(command: Command, put: Put) -> None:
-    """The range of the metadata is advice; the vehicle decides."""
-    vehicle = quad()
-    words = ("set", put(vehicle), "MC_ROLL_P=40", "--metadata", "vehicle", "--no-cache")
-    assert command(*words).code == 2
-    assert not vehicle.requests["PARAM_SET"]
-    done = command(*words, "--force")
-    assert done.code == 0
-    assert "paramclient: MC_ROLL_P: 40 is above the maximum of 12 1/s\n" in done.err
-    assert vehicle.values["MC_ROLL_P"] == 40
-
-
 # get
 
 
