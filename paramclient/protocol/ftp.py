@@ -46,8 +46,8 @@ BLOCK_PAUSE_MIN: Final = 0.05
 """Seconds without a further block after which a burst counts as over."""
 BLOCK_INTERVALS: Final = 8
 """Mean intervals between two blocks after which a burst counts as over."""
-COPIES_AT_ONCE: Final = 16
-"""Reads sent for the last blocks, in several copies: one round trip of 100 ms has room for as many."""
+COPIES_TIME: Final = 0.1
+"""Seconds of blocks for which reads are sent in several copies, for the last blocks."""
 BLOCK_INTERVAL: Final = 0.006
 """Seconds in which a vehicle serves one read: ArduPilot sends a block every 5.9 ms (measured)."""
 READS_MAX: Final = 64
@@ -369,6 +369,7 @@ class _FileReader:
         self._pieces = _Pieces()
         self._has_bursts = True
         self._began = self._last = 0.0
+        self._interval = BLOCK_INTERVAL  # between two blocks, as the vehicle or the link allows
         self._reads = 0  # in progress
         self._bursts = 0  # that were requested, and have not ended
 
@@ -438,8 +439,9 @@ class _FileReader:
                 return True
             self._take(packet.offset, packet.data)
             first, blocks = min(first, self._last), blocks + 1
-            interval = (self._last - first) / max(blocks, 1)
-            pause = max(BLOCK_PAUSE_MIN, BLOCK_INTERVALS * interval)
+            if blocks:
+                self._interval = max(BLOCK_INTERVAL, (self._last - first) / blocks)
+                pause = max(BLOCK_PAUSE_MIN, BLOCK_INTERVALS * self._interval)
             if packet.burst_complete:
                 return True
 
@@ -465,14 +467,14 @@ class _FileReader:
                 for at in wanted:
                     await window.acquire()
                     tasks.start_soon(self._read_block, at, window)
-                    await anyio.sleep(BLOCK_INTERVAL)
+                    await anyio.sleep(self._interval)
 
     async def _read_block(self, offset: int, window: anyio.Semaphore) -> None:
         """Read one block, or find the end of the file there."""
         channel, pieces = self._channel, self._pieces
 
         def copies(attempt: int) -> int:
-            return max(1, min(channel.timing.copies, COPIES_AT_ONCE // self._reads))
+            return max(1, min(channel.timing.copies, int(COPIES_TIME / self._interval) // self._reads))
 
         try:
             answer = await _request(

@@ -311,3 +311,15 @@ async def test_a_file_of_a_table_that_changes_meanwhile_is_right_in_the_end() ->
         assert {name: each.bits for name, each in vehicle.params.items()} == {
             name: each.bits for name, each in result.params.items() if each.index is not None
         }
+
+
+@pytest.mark.parametrize("rate", [4_500.0, 2_000.0])
+async def test_a_burst_over_a_slow_link_is_requested_once(rate: float) -> None:
+    """A block of it takes longer than a pause in a quick burst."""
+    endpoint = Tap(Air.symmetric([ArduPilotVehicle()], loss=0.05, delay=0.05, rate=rate, seed=1))
+    async with talking(endpoint) as (conversation, session):
+        result = await fetch_all(session)
+        assert (result.source, result.complete) == ("ftp", True)
+        sent = [each.opcode for each in packets_in(conversation.sent_of(FileTransfer))]
+        assert sent.count(Opcode.BURST_READ_FILE) <= 2
+        assert result.elapsed < 30_000 / rate
