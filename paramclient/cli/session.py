@@ -340,14 +340,19 @@ async def sessions(
         if choice.is_all:
             with _waiting(client, "vehicles"):
                 found = await client.find_autopilots(timeout=deadline.heartbeat_timeout)
-            if not writes:
-                found += await _others_with_parameters(client)
+            known = [each for each in client.components.values() if each.node.identification.has_parameters]
+            if options.extended:
+                found = await _with_parameters([each.ext for each in known])
+            elif not (writes or client.listens_only):
+                found += await _with_parameters([each for each in known if each not in found])
+            if not found:
+                raise NoReply("a component with extended parameters", attempts=0, waited=OTHERS_TIMEOUT)
         else:
             found = [await wait_for_vehicle(client, choice, deadline, only=writes)]
+            if options.extended:
+                found = [each.ext for each in found]
         if writes:
             await wait_for_firmware(found, deadline)
-        if options.extended:
-            found = [each.ext for each in found]
         for each in found:
             if not each.is_extended and expects_extended(each.identity.vehicle_type, each.component):
                 say(f"{each.system}/{each.component} usually has extended parameters: --extended uses them")
@@ -371,25 +376,24 @@ def _client(url: str, options: TrafficOptions, **more: Any) -> ParamClient:
 # Vehicles
 
 
-async def _others_with_parameters(client: ParamClient) -> list[Component]:
-    """Return the components beside the autopilots that have parameters, and print a line for each other."""
-    others = [each for each in client.components.values() if each.node.identification.has_parameters]
-    others = [each for each in others if each not in client.autopilots]
+async def _with_parameters(components: Sequence[Component]) -> list[Component]:
+    """Return the components that have a parameter, and print a line for each other."""
 
     async def ask(component: Component) -> None:
-        try:
-            await component.get(0, timeout=OTHERS_TIMEOUT)
-        except NoReply:
-            what = f"{node_in_words(component.node)} has no parameters, or none within {OTHERS_TIMEOUT:g} s"
-            say(f"{what}; --extended uses extended ones")
-        except UnknownParameter:
-            pass
+        with suppress(UnknownParameter):
+            try:
+                await component.get(0, timeout=OTHERS_TIMEOUT)
+            except NoReply:
+                noun, hint = "parameters", "; --extended uses extended ones"
+                if component.is_extended:
+                    noun, hint = "extended parameters", ""
+                what = f"{node_in_words(component.node)} has no {noun}, or none within {OTHERS_TIMEOUT:g} s"
+                say(f"{what}{hint}")
 
-    if not client.listens_only:
-        async with anyio.create_task_group() as tasks:
-            for each in others:
-                tasks.start_soon(ask, each)
-    return [each for each in others if each.count is not None]
+    async with anyio.create_task_group() as tasks:
+        for each in components:
+            tasks.start_soon(ask, each)
+    return [each for each in components if each.count is not None]
 
 
 async def wait_for_vehicle(

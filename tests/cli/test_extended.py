@@ -136,6 +136,15 @@ def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put
     assert command("diff", 1, url, *CAMERA).code == 0
 
 
+def test_all_are_those_that_have_some(command: Command, put: Put) -> None:
+    url = put(Air.symmetric([PX4Vehicle(table={"A": 1}), small()]))
+    fetched = command("fetch", url, "--vehicle", "all", "--extended", "--json")
+    assert (fetched.code, [each["component"] for each in fetched.json["vehicles"]]) == (0, [100])
+    assert fetched.err.startswith("1/1 PX4 quadrotor has no extended parameters, or none within 2.5 s\n")
+    none = command("fetch", put(PX4Vehicle(table={"A": 1})), "--vehicle", "all", "--extended")
+    assert (none.code, "a component with extended parameters" in none.err) == (3, True)
+
+
 def test_the_history_of_extended_parameters(command: Command, put: Put) -> None:
     url = put(small())
     assert command("set", url, *CAMERA, "CAM_NAME", "Rear", "CAM_KEY", "hex:01").code == 0
