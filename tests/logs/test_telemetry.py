@@ -16,7 +16,6 @@ from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType
 from tests.recordings import DATA, from_vehicle, param_values, read
-from tests.shell import in_simulated_time
 from tests.telemetry import KEY, NOW, UID, Log
 
 
@@ -32,7 +31,6 @@ def a_replay(path: Path | str, **options: object) -> ParamClient:
 # Names
 
 
-@in_simulated_time
 async def test_a_file_that_is_not_a_log(tmp_path: Path) -> None:
     with pytest.raises(LinkError, match=r"cannot open .*nowhere\.tlog: No such file"):
         async with a_replay(tmp_path / "nowhere.tlog"):
@@ -59,7 +57,6 @@ async def test_a_file_that_is_not_a_log(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "crc"), [("px4_full_download", 0xCF579589), ("ardupilot_full_download", None)]
 )
-@in_simulated_time
 async def test_a_recording_gives_a_complete_table(name: str, crc: int | None, speed: str) -> None:
     async with a_replay(f"{DATA / name}.tlog{speed}") as client:
         assert client.cache is None
@@ -77,7 +74,6 @@ async def test_a_recording_gives_a_complete_table(name: str, crc: int | None, sp
 
 
 @pytest.mark.parametrize(("speed", "expected"), [("", 20.0), ("?speed=4", 5.0), ("?speed=0", 0.0)])
-@in_simulated_time
 async def test_frames_have_the_times_of_the_log(speed: str, expected: float, tmp_path: Path) -> None:
     path = whole(A=1).wait(19.0).beat().write(tmp_path / "flight.tlog")
     began = anyio.current_time()
@@ -86,7 +82,6 @@ async def test_frames_have_the_times_of_the_log(speed: str, expected: float, tmp
         assert anyio.current_time() - began == pytest.approx(expected, abs=0.1)
 
 
-@in_simulated_time
 async def test_long_pauses_and_clocks_that_go_back(tmp_path: Path) -> None:
     path = Log().beat().wait(86400.0).beat().wait(-1e6).beat().write(tmp_path / "flight.tlog")
     began = anyio.current_time()
@@ -97,7 +92,6 @@ async def test_long_pauses_and_clocks_that_go_back(tmp_path: Path) -> None:
         assert anyio.current_time() - began == pytest.approx(PAUSE_MAX, abs=0.1)
 
 
-@in_simulated_time
 async def test_missing_parameters_are_reported_at_the_end_of_the_log(tmp_path: Path) -> None:
     log = Log().beat().report("A", 0, A=1, B=2, C=3).report("C", 2)
     async with a_replay(log.write(tmp_path / "flight.tlog")) as client:
@@ -113,7 +107,6 @@ async def test_missing_parameters_are_reported_at_the_end_of_the_log(tmp_path: P
         assert component.params["A"].trust is Trust.LIVE
 
 
-@in_simulated_time
 async def test_requests_to_a_log_fail(tmp_path: Path) -> None:
     path = whole(A=1).write(tmp_path / "flight.tlog")
     async with a_replay(path) as client:

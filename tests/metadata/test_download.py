@@ -22,7 +22,7 @@ from paramclient.model.px4_hash import crc32_px4
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.sim.px4 import GENERAL_FILE, METADATA_FILE
 from paramclient.wire.messages import FileTransfer
-from tests.shell import Tap, a_client, generic, in_simulated_time, outcome, residue, small_px4
+from tests.shell import Tap, a_client, generic, outcome, residue, small_px4
 
 IDENTITY = Identity(1, "link", "abcd", 12, 2, 0x01110000, "0123abcd", 1)
 
@@ -57,7 +57,6 @@ async def files_in(folder: Path) -> list[Path]:
 # Complete downloads
 
 
-@in_simulated_time
 async def test_a_vehicle_describes_its_parameters() -> None:
     vehicle = PX4Vehicle(metadata=True)
     async with a_client(vehicle) as client:
@@ -74,7 +73,6 @@ async def test_a_vehicle_describes_its_parameters() -> None:
         assert not vehicle.open_files
 
 
-@in_simulated_time
 async def test_a_cached_file_is_not_downloaded_again(tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     for expected in (True, False):
@@ -99,7 +97,6 @@ async def test_a_cached_file_is_not_downloaded_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle, generic])
-@in_simulated_time
 async def test_vehicles_without_metadata(make: Any) -> None:
     async with a_client(make()) as client:
         component = await client.component()
@@ -108,7 +105,6 @@ async def test_vehicles_without_metadata(make: Any) -> None:
         assert anyio.current_time() - began < 1.5
 
 
-@in_simulated_time
 async def test_nothing_is_downloaded_from_the_internet() -> None:
     vehicle = describing()
     publish(vehicle, uri="https://example.invalid/parameters.json.xz")
@@ -120,7 +116,6 @@ async def test_nothing_is_downloaded_from_the_internet() -> None:
     assert caught.value.source == "https://example.invalid/parameters.json.xz"
 
 
-@in_simulated_time
 async def test_a_file_on_another_component() -> None:
     vehicle, camera = describing(), PX4Vehicle(component=100, table={"CAM_MODE": 1})
     camera.files["/p.json"] = json.dumps({"version": 1, "parameters": [{"name": "CAM_MODE"}]}).encode()
@@ -133,7 +128,6 @@ async def test_a_file_on_another_component() -> None:
 
 
 @pytest.mark.parametrize("wrong", ["checksum", "missing", "damaged", "long"])
-@in_simulated_time
 async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> None:
     vehicle = describing()
     content = vehicle.files[METADATA_FILE]
@@ -165,7 +159,6 @@ async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> No
         assert not vehicle.open_files
 
 
-@in_simulated_time
 async def test_a_vehicle_that_does_not_respond() -> None:
     tap = Tap(describing())
     async with a_client(tap) as client:
@@ -179,7 +172,6 @@ async def test_a_vehicle_that_does_not_respond() -> None:
         assert await metadata_of(component) is not None
 
 
-@in_simulated_time
 async def test_cancellation_closes_files_and_sessions(tmp_path: Path) -> None:
     """At every point of the download."""
     for moment in (0.001, 0.012, 0.03, 0.05, 0.1, 0.2):
@@ -193,7 +185,6 @@ async def test_cancellation_closes_files_and_sessions(tmp_path: Path) -> None:
             assert await metadata_of(component) is not None
 
 
-@in_simulated_time
 async def test_a_too_large_file_is_not_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(download, "PACKED_SIZE_MAX", 400)
     vehicle = describing()
