@@ -35,6 +35,8 @@ CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
 AT_ONCE: Final = 4
 """Requests sent at once: of five, a Plane and a Rover lose the next one within 10 ms (measured)."""
+INTERVAL_FIRST: Final = 0.012
+"""Seconds from these to the next request."""
 INTERVAL: Final = 0.006
 """Seconds between further requests: ArduPilot loses some of those sent every 4 ms (measured)."""
 REQUEST_SIZE: Final = 54
@@ -297,7 +299,7 @@ class _Proof:
         async with task_group() as tasks:
             for place, number in enumerate(sorted(numbers, reverse=True)):
                 if place >= AT_ONCE:
-                    await anyio.sleep(INTERVAL)
+                    await anyio.sleep(INTERVAL if place > AT_ONCE else INTERVAL_FIRST)
                 tasks.start_soon(request, number)
             sent_at = anyio.current_time()
         session.serves_checksum = True
