@@ -117,12 +117,10 @@ class Gateway:
     def pass_on(self, link: VehicleLink, seen: SeenFrame, peer: Hashable) -> None:
         """Pass a frame of a vehicle to all stations, but for answers to the gateway."""
         table = link.table_of_answer(seen, peer)
-        is_answer = table is not None and table.withholds
-        is_copy = not is_answer and self.copies.is_copy(seen.data, (link, peer))
-        if bears_key(seen.data) or is_copy:
+        if bears_key(seen.data) or (table is None and self.copies.is_copy(seen.data, (link, peer))):
             return
         for station in self.stations:
-            if is_answer and table is not None and self._serves(station, table, link):
+            if table is not None and self._serves(station, table, link):
                 station.withhold(seen)
                 table.take_over(station)
             else:
@@ -132,7 +130,7 @@ class Gateway:
         """Send a value that has changed to all stations."""
         for station in self.stations:
             if self._serves(station, table, link):
-                station.say(message, table.source)
+                station.say(message, table.source, is_answer=False)
 
     # requests
 
@@ -165,11 +163,9 @@ class Gateway:
         extended = isinstance(message, EXTENDED_REQUESTS)
         found = {table: link for link in self.links for table in link.tables(*address, extended=extended)}
         served = [table for table, link in found.items() if self._serves(station, table, link)]
-        if not served:
-            return False
-        is_list = isinstance(message, ListRequest)
-        if not is_list and len({table.source[0] for table in found}) > 1:
-            return False  # for whichever vehicle: they answer themselves
+        systems = {table.source[0] for table in found}
+        if not served or (len(systems) > 1 and not isinstance(message, ListRequest)):
+            return False  # if it is for whichever vehicle, they answer themselves
         present = [table for table in served if not table.is_lost]
         autopilots = [table for table in present if table.source[1] == messages.AUTOPILOT_COMPONENT]
         one = (autopilots or present)[:1]  # that answers a request which all components receive
@@ -202,8 +198,7 @@ class Gateway:
         is_double = any(each is not link and each.is_vehicle(table.source) for each in self.links)
         if is_double and table.source not in self._warned:
             self._warned.add(table.source)
-            what = "is on two links: stations are not answered from its table, and all frames pass"
-            logger.warning("%d/%d %s", *table.source, what)
+            logger.warning("%d/%d is on two links: stations are not answered from its table", *table.source)
         return not is_double
 
     def _pass(self, station: GroundStation, seen: SeenFrame) -> None:
@@ -293,18 +288,18 @@ class VehicleLink(Tap):
                 yield self._table(node, extended=extended)
 
     def table_of_answer(self, seen: SeenFrame, peer: Hashable) -> KeptTable | None:
-        """Return the table to which a value or an answer belongs; None for another frame."""
+        """Return the table to which a withheld value or answer belongs; None for a frame that passes."""
         frame = seen.frame
         node = self._station.nodes.get((frame.system, frame.component))
         if node is None or node.peer != peer:
             return None
-        table = self._table(node, extended=False)  # from its first frame on, for its changes
+        plain = self._table(node, extended=False)  # from its first frame on, for its changes
         extended = self._table(node, extended=True)
-        if frame.message_id in EXTENDED_ANSWERS:
-            return extended
+        is_extended = frame.message_id in EXTENDED_ANSWERS
         is_for_us = _target_of(frame) == self._station.own_address[0]
-        is_answer = frame.message_id in PLAIN_ANSWERS or (frame.message_id == FILE_TRANSFER and is_for_us)
-        return table if is_answer else None
+        is_plain = frame.message_id in PLAIN_ANSWERS or (frame.message_id == FILE_TRANSFER and is_for_us)
+        table = extended if is_extended else plain
+        return table if (is_extended or is_plain) and table.withholds else None
 
     def _table(self, node: Node, *, extended: bool) -> KeptTable:
         session = node.extended if extended else node.plain
@@ -376,8 +371,7 @@ def _target_of(frame: Frame) -> int:
 
 def _readdressed(message: ListRequest, frame: Frame, target: Source) -> bytes:
     """Return a request for a list to one component, in the name of the station."""
-    system, component = target
-    single = replace(message, target_system=system, target_component=component)
+    single = replace(message, target_system=target[0], target_component=target[1])
     sender = {"system": frame.system, "component": frame.component, "version": frame.version}
     return encode(single, sequence=frame.sequence, **sender)
 

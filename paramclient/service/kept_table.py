@@ -361,10 +361,9 @@ class KeptTable(Stream[Change]):
         table = self.session.table
         if which == HASH_CHECK:
             return None if self.state_key is None else digest_of(self.session)
-        name = table.names.get(which) if isinstance(which, int) else which
+        name, index = (table.names.get(which), which) if isinstance(which, int) else (which, None)
         param = known_param(self.session, name)
-        by_index = which if isinstance(which, int) else None
-        return None if param is None else value_of(self.session, param, index=by_index)
+        return None if param is None else value_of(self.session, param, index=index)
 
     def _is_unknown(self, which: Which) -> bool:
         is_beyond = isinstance(which, int) and which not in self.session.table.names
@@ -463,8 +462,8 @@ class KeptTable(Stream[Change]):
             self._say(askers, messages.ParamExtAck(name, raw, number, result))
             return
         self._refuse(askers, name, code)
-        value = self.known(name)
-        if value is not None and code in (ParamErrorCode.READ_ONLY, ParamErrorCode.VALUE_OUT_OF_RANGE):
+        stays = code in (ParamErrorCode.READ_ONLY, ParamErrorCode.VALUE_OUT_OF_RANGE)
+        if stays and (value := self.known(name)):
             self._say(askers, value)
 
     def _refuse(self, askers: Iterable[Asker], which: Which, code: int) -> None:

@@ -130,7 +130,7 @@ class GroundStation:
         self.writing = anyio.CapacityLimiter(SETS_AT_ONCE)
         self.relayed = self.answered = self.dropped = self.saved = 0
         self._numbering: defaultdict[Source, Numbering] = defaultdict(Numbering)
-        self._queue: deque[tuple[Source, bytes | Message | None]] = deque()  # relayed, inserted, withheld
+        self._queue: deque[tuple[Source, bytes | Message | None, bool]] = deque()  # None: withheld
         self._streams: dict[Hashable, tuple[Source, Iterator[Message]]] = {}
         self._is_turn_of_streams = False
         self._held: bytes | None = None  # numbered, but too long for the last datagram
@@ -181,10 +181,10 @@ class GroundStation:
         """Leave a frame of a vehicle out, so that it does not count as lost."""
         self._put((seen.frame.system, seen.frame.component), None)
 
-    def say(self, message: Message, source: Source) -> None:
+    def say(self, message: Message, source: Source, *, is_answer: bool = True) -> None:
         """Queue a message in the name of a component; none that MAVLink 1 lacks for a station of that."""
         if self.version == 2 or message_id(type(message)) <= V1_MESSAGE_ID_MAX:
-            self._put(source, message)
+            self._put(source, message, is_answer)
 
     def stream(self, key: Hashable, source: Source, messages: Iterator[Message]) -> None:
         """Send messages one by one as the station takes them, in place of an earlier stream of this key."""
@@ -225,9 +225,9 @@ class GroundStation:
                         await self.endpoint.link.send(data, self.peer)
                 await self._something_to_send.wait()
 
-    def _put(self, source: Source, item: bytes | Message | None) -> None:
+    def _put(self, source: Source, item: bytes | Message | None, is_answer: bool = False) -> None:
         if len(self._queue) < STATION_QUEUE_MAX:
-            self._queue.append((source, item))
+            self._queue.append((source, item, is_answer))
             self._something_to_send.set()
         else:
             self.dropped += 1
@@ -240,12 +240,12 @@ class GroundStation:
 
     def _next_of_queue(self) -> bytes | None:
         while self._queue:
-            source, item = self._queue.popleft()
+            source, item, is_answer = self._queue.popleft()
             numbering = self._numbering[source]
             if item is None:
                 numbering.withhold()
             elif not isinstance(item, bytes):
-                return self._inserted(source, item)
+                return self._inserted(source, item, is_answer)
             else:
                 self.relayed += 1
                 is_version_2 = item[0] == 0xFD
@@ -257,19 +257,19 @@ class GroundStation:
     def _next_of_streams(self) -> bytes | None:
         for key, (source, messages) in list(self._streams.items()):
             for message in messages:
-                return self._inserted(source, message)
+                return self._inserted(source, message, is_answer=True)
             del self._streams[key]
         return None
 
-    def _inserted(self, source: Source, message: Message) -> bytes:
+    def _inserted(self, source: Source, message: Message, is_answer: bool) -> bytes:
         number = self._numbering[source].insert()
         system, component = source
         data = encode(message, system=system, component=component, sequence=number, version=self.version)
         if self.endpoint.signer is not None:
             self.endpoint.signer.advance(anyio.current_time())
             data = sign_frame(data, self.endpoint.signer)
-        self.answered += 1
-        self.saved += len(data)
+        self.answered += is_answer
+        self.saved += len(data) * is_answer
         return data
 
 

@@ -49,7 +49,7 @@ from paramclient.wire.messages import (
 from paramclient.wire.signing import SigningKey
 from tests.conversations.virtual import Puppet
 from tests.service.ground_stations import Partner, Served, StationsLink, free_port, gateway_over
-from tests.service.hub import browsing
+from tests.service.hub import V, browsing
 from tests.shell import PeersLink, Radio, Tap, a_client, bits, generic, small_px4, until
 
 LIST = ParamRequestList(1, 1)
@@ -331,13 +331,15 @@ def test_rule_2_a_file_with_defaults_that_are_unknown_is_one_without() -> None:
     assert unknown.content(full, 80)[:2] == b"\x1b\x67"
 
 
-async def test_rule_2_the_checksum_of_the_parameter_file() -> None:
-    data = b"@PARAM/param.pck"
+@pytest.mark.parametrize("query", [b"", b"?withdefaults=1"])
+async def test_rule_2_the_checksum_of_the_parameter_file(query: bytes) -> None:
+    """The vehicle may send a default that is the value, which the table does not keep."""
+    data = b"@PARAM/param.pck" + query
     request = FileTransfer(0, 1, 1, Packet(1, 0, Opcode.CALC_FILE_CRC32, data).pack())
     [wanted] = [each for each in directly(ArduPilotVehicle(), request) if isinstance(each, FileTransfer)]
     async with in_sync(ArduPilotVehicle()) as (_, vehicle, station):
         assert await station.ask_file(Opcode.CALC_FILE_CRC32, data=data) == [Packet.unpack(wanted.payload)]
-        assert not vehicle.messages(FileTransfer)
+        assert bool(vehicle.messages(FileTransfer)) == bool(query)
 
 
 async def test_rule_2_other_files_pass_and_an_upload_has_the_table_proven() -> None:
@@ -928,13 +930,17 @@ def test_rule_13_names_of_endpoints(tmp_path: Path) -> None:
 async def test_rule_14_stations_are_shown_with_what_they_save() -> None:
     link = StationsLink()
     async with browsing(small_px4(), mavlink=[MavlinkEndpoint(link)]) as browser:
-        station = Partner(link)
+        station, quiet = Partner(link), Partner(link, system=9)
         await station.ask(LIST)
-        [shown] = (await browser.get("/api/stations")).json()
+        saved = sum(map(len, station.datagrams))
+        await quiet.ask(GCS)
+        await browser.put(f"{V}/params/PARAM_01", json={"value": 9})
+        shown, other = (await browser.get("/api/stations")).json()
+        assert (other["answered"], other["saved_bytes"], list(by_name(quiet))) == (0, 0, ["PARAM_01"])
         assert shown["name"] == "udpin:stations:14551#station:0"
         assert (shown["ids"], shown["requests"]) == (["255/190"], {"ParamRequestList": 1})
         assert shown["answered"] == 26
-        assert shown["saved_bytes"] == sum(map(len, station.datagrams)) > 700
+        assert shown["saved_bytes"] == saved > 700
         metrics = (await browser.get("/metrics")).text
         assert 'paramclient_stations_answered{endpoint="udpin:stations:14551"} 26.0' in metrics
 
