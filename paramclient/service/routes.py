@@ -18,6 +18,7 @@ import anyio
 import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Request
 from fastapi.responses import PlainTextResponse, Response
+from fastapi.security import HTTPBearer
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import AwareDatetime, BaseModel, BeforeValidator, Field, model_validator
 from pydantic import StrictFloat as Real
@@ -51,8 +52,8 @@ FILE_BYTES_MAX: Final = 2 * 2**20
 """Maximum size of a parameter file in bytes; a table of 10,000 parameters takes 1 MB."""
 VALUES_MAX: Final = 10_000
 """Maximum number of values of a request: more than a vehicle has."""
-STATION_SUMS: Final = ("relayed", "answered", "saved", "dropped")
-"""Attributes of `GroundStation` whose sums over the connected stations of an endpoint are metrics."""
+FILE: Final[dict[int | str, dict[str, Any]]] = {200: {"content": {"application/octet-stream": {}}}}
+"""The response with a file, for the OpenAPI document."""
 _PAGE_NAME: Final = re.compile(r"[A-Za-z0-9._ -]{1,64}")
 
 Sample: TypeAlias = tuple[Mapping[str, object], float]
@@ -104,7 +105,6 @@ Moment = Annotated[
     BeforeValidator(_parse_moment),
     Field(description="The number of a snapshot, or a time with its zone."),
 ]
-Force = Annotated[bool, Field(description="Write values out of range, NaN and infinities.")]
 Durable = Annotated[bool, Field(description="Respond after value and history are on the disk.")]
 
 
@@ -112,7 +112,7 @@ class WriteOptions(Body):
     """Options of writes; see `Component.set`."""
 
     settle: Annotated[float, Field(ge=0, le=60, alias="settle_s")] = 0.0
-    force: Force = False
+    force: Annotated[bool, Field(description="Write values out of range, NaN and infinities.")] = False
     durable: Durable = False
     timeout: Annotated[Seconds, Field(alias="timeout_s")] = None
 
@@ -164,7 +164,14 @@ class UploadedFile(Body):
         return file.choose(chosen, system=component.system if is_of_several else None)
 
 
-class PlanRequest(Body):
+class PlanOptions(Body):
+    """What else is written; `include` takes names, patterns and categories, such as out-of-range."""
+
+    include: Patterns = ()
+    force: Annotated[bool, Field(description="Write NaN and infinities.")] = False
+
+
+class PlanRequest(PlanOptions):
     """Wanted parameters: exactly one of `values`, `file` and `at`, limited to `only`."""
 
     one_of = ("values", "file", "at")
@@ -172,15 +179,11 @@ class PlanRequest(Body):
     file: UploadedFile | None = None
     at: Moment | None = None
     only: Patterns | None = None
-    include: Patterns = ()
-    force: Force = False
 
 
-class RunOptions(Body):
+class RunOptions(PlanOptions):
     """Options of an apply or restore; see `paramclient.provision.apply`."""
 
-    include: Patterns = ()
-    force: Force = False
     reboot: bool = False
     allow_armed: bool = False
     timeout: Annotated[Seconds, Field(alias="timeout_s")] = None
@@ -225,9 +228,11 @@ async def require_write(request: Request) -> None:
         raise ServiceError(403, "forbidden", "This request requires a token that may write.")
 
 
-reading = APIRouter()
-writing = APIRouter(dependencies=[Depends(require_write)])
-ROUTERS: Final = (reading, writing)
+bearer = Depends(HTTPBearer(auto_error=False))  # described here, and checked before
+public = APIRouter()
+reading = APIRouter(dependencies=[bearer])
+writing = APIRouter(dependencies=[bearer, Depends(require_write)])
+ROUTERS: Final = (public, reading, writing)
 
 
 async def _hub_of(request: Request) -> Hub:
@@ -258,7 +263,7 @@ TargetArgument = Annotated[Target, Depends(_target_of)]
 # the service
 
 
-@reading.get("/health")
+@public.get("/health")
 async def health(request: Request, hub: HubArgument) -> dict[str, Any]:
     """Return that the service responds; with a valid token also its role, and the links."""
     holder = request.state.holder
@@ -372,7 +377,7 @@ async def read_file(body: UploadedFile) -> dict[str, Any]:
     return {"file": file.source, "format": file.file_format, "notes": file.notes, "components": sets}
 
 
-@reading.get(f"{VEHICLE}/file", response_class=Response)
+@reading.get(f"{VEHICLE}/file", response_class=Response, responses=FILE)
 async def file(
     target: TargetArgument,
     file_format: Annotated[FileFormat, Query(alias="format")] = FileFormat.QGC,
@@ -510,7 +515,7 @@ async def history(
 # metrics
 
 
-@reading.get("/metrics")
+@reading.get("/metrics", response_class=PlainTextResponse)
 async def metrics(hub: HubArgument) -> PlainTextResponse:
     """Return the metrics for Prometheus in text format."""
     lines = []
@@ -543,6 +548,6 @@ def _metrics(hub: Hub) -> Iterator[tuple[str, Sequence[Sample]]]:
 
     endpoints = [({"endpoint": each.name}, each.stations.values()) for each in hub.gateway.endpoints]
     yield "stations", [(at, len(stations)) for at, stations in endpoints]
-    for name in STATION_SUMS:
+    for name in ("relayed", "answered", "saved", "dropped"):
         sums = [(at, sum(getattr(each, name) for each in stations)) for at, stations in endpoints]
         yield f"stations_{name}", sums

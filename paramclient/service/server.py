@@ -24,8 +24,8 @@ import anyio
 import uvicorn
 from fastapi import FastAPI
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.middleware.body_limit import RequestBodyLimitMiddleware
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -39,9 +39,8 @@ from paramclient.version import __version__
 
 BODY_BYTES_MAX: Final = 4 * 2**20
 """Maximum size of a request body in bytes: a parameter file of 2 MB in base64, and some."""
-LOOPBACK_NAMES: Final = ("localhost", "127.0.0.1", "[::1]")
-"""Names of this computer in the header Host: without tokens, no other site can point its name at the service
-and let its pages read."""
+_ADDRESS: Final = re.compile(r"(?:\[([0-9a-fA-F:.]+)\]|([^:\s]+))(?::([0-9]{1,5}))?")
+"""A host and a port; an IPv6 address is in brackets."""
 CONNECTIONS_MAX: Final = 200
 """Maximum number of connections, and of requests; further ones get the status 503."""
 IDLE_TIMEOUT: Final = 30
@@ -177,7 +176,7 @@ def guard(app: ASGIApp, tokens: Tokens | None) -> ASGIApp:
 
         try:
             scope.setdefault("state", {})["holder"] = _holder_of(scope, tokens)
-        except ServiceError as error:
+        except (ServiceError, HTTPException) as error:
             await problem_response(error)(scope, receive, send_with_headers)
         else:
             await app(scope, receive, send_with_headers)
@@ -189,14 +188,21 @@ def _holder_of(scope: Scope, tokens: Tokens | None) -> TokenHolder | None:
     """Return the holder of the token of a request; None without a token where none is needed.
 
     Raises:
-        ServiceError: 401, a token is missing or wrong; 403, a page of another site would change something.
+        ServiceError: 400, the host is not this computer, without tokens; 401, a token is missing or wrong;
+            403, a page of another site would change something.
+        HTTPException: 413, the body is too long.
     """
     headers = Headers(scope=scope)
     origin, given = headers.get("origin"), headers.get("authorization")
     is_write = scope["method"] not in SAFE_METHODS
     if is_write and origin is not None and origin.partition("://")[2] != headers.get("host"):
         raise ServiceError(403, "other-origin", f"Pages of {origin[:200]} may not change anything here.")
+    if int(headers.get("content-length", 0)) > BODY_BYTES_MAX:
+        raise HTTPException(413)
     if tokens is None:
+        found = _ADDRESS.fullmatch(headers.get("host", ""))
+        if found is None or not _is_loopback(found[1] or found[2]):  # the name of another site points here
+            raise ServiceError(400, "invalid-host", "Without tokens, the host must be this computer.")
         return LOCAL
     if given is not None:
         scheme, _, token = given.partition(" ")
@@ -253,8 +259,6 @@ def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
     app.add_middleware(RequestBodyLimitMiddleware, max_body_size=BODY_BYTES_MAX)
     app.add_middleware(cancel_on_disconnect)
     app.add_middleware(guard, tokens=tokens)
-    if tokens is None:
-        app.add_middleware(TrustedHostMiddleware, allowed_hosts=LOOPBACK_NAMES, www_redirect=False)
     for router in routes.ROUTERS:
         app.include_router(router)
     page = resources.files("paramclient.service").joinpath("page")
@@ -281,8 +285,8 @@ def listen_at(address: str, *, is_protected: bool) -> tuple[socket.socket, str]:
         UsageError: the address has another format, or other computers could connect.
         LinkError: the address cannot be listened on.
     """
-    found = re.fullmatch(r"(?:\[([0-9a-fA-F:.]+)\]|([^:\s]+)):([0-9]{1,5})", address)
-    if found is None or int(found[3]) > PORT_MAX:
+    found = _ADDRESS.fullmatch(address)
+    if found is None or not 0 <= int(found[3] or -1) <= PORT_MAX:
         what = "is not a listening address HOST:PORT such as 127.0.0.1:8765 or [::1]:0"
         raise UsageError(f"{address!r} {what}")
     host, family = (found[1], socket.AF_INET6) if found[1] else (found[2], socket.AF_INET)
