@@ -169,7 +169,7 @@ class Gateway:
         present = [table for table in served if not table.is_lost]
         autopilots = [table for table in present if table.source[1] == messages.AUTOPILOT_COMPONENT]
         one = (autopilots or present)[:1]  # that answers a request which all components receive
-        may_write = station.may_sign or not any(link.client.signing_report() for link in found.values())
+        may_write = station.may_sign or not any(link.is_signed for link in found.values())
         asker = Asker(station, *source, may_write)
         match message:
             case messages.ParamRequestList() | messages.ParamExtRequestList():
@@ -219,8 +219,6 @@ class VehicleLink(Tap):
         client: of the link.
 
     Attributes:
-        client: as given.
-        send: sends a frame of a station to the vehicles.
         systems: the system ids that were heard.
         signing: the components that sign.
         file: returns the parameter file of a table.
@@ -230,11 +228,15 @@ class VehicleLink(Tap):
         self.systems: set[int] = set()
         self.signing: set[Source] = set()
         self._gateway = gateway
-        self.client = client
-        self.send = client.core.link_task.forward
+        self._client = client
         self._station = client.core.station
         self._tables: dict[Session, KeptTable] = {}
         self.file = cache(KeptFile)
+
+    @property
+    def is_signed(self) -> bool:
+        """Whether the client signs what it sends."""
+        return self._client.signing_report() is not None
 
     async def run(self) -> None:
         """Take part in the gateway while the client is open."""
@@ -252,6 +254,10 @@ class VehicleLink(Tap):
     def sent(self, frame: bytes) -> None:
         """Take note of a frame to the vehicles."""
         self._gateway.copies.sent_up(frame)
+
+    def send(self, data: bytes) -> None:
+        """Send a frame of a station to the vehicles."""
+        self._client.core.link_task.forward(data)
 
     def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
         """Pass the frames of a chunk on; the client has taken them before."""
@@ -304,7 +310,7 @@ class VehicleLink(Tap):
     def _table(self, node: Node, *, extended: bool) -> KeptTable:
         session = node.extended if extended else node.plain
         if session not in self._tables:
-            component = self.client.components[node.system, node.component]
+            component = self._client.components[node.system, node.component]
             announce = partial(self._gateway.announce, self)
             self._tables[session] = KeptTable(component.ext if extended else component, announce)
         return self._tables[session]

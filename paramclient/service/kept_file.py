@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, NamedTuple
@@ -16,8 +16,7 @@ from paramclient.protocol.checksum import CHECKED_READ_SIZE, may_be_rounded
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode
 from paramclient.protocol.session import Session
-from paramclient.service.kept_table import Asker, KeptTable, Pending
-from paramclient.service.stations import SessionKey
+from paramclient.service.kept_table import Asker, KeptTable
 from paramclient.wire.messages import FileTransfer
 
 ENTRY_SIZE: Final = 12
@@ -26,7 +25,7 @@ FILE_WAIT: Final = 2.5
 """Seconds that the opening of the file waits for a fetch; then there is no such file, and the station asks
 for the list, which it gets as it is fetched. QGroundControl asks three times, 1 s apart."""
 OPEN_FILES_MAX: Final = 64
-"""Files that a station has open, at most; the oldest is closed first."""
+"""Files that stations have open of one component, at most; the oldest is closed first."""
 
 
 class FileQuery(NamedTuple):
@@ -113,11 +112,11 @@ def answers_of(request: Packet, content: bytes) -> Iterator[Packet]:
 
 @dataclass(slots=True)
 class _OpenFile:
-    """A file that a station has open; `content` from the first read on."""
+    """A file that a station has open; `sequence` of its opening, `content` from the first read on."""
 
-    opening: Packet
     query: FileQuery
     rows: Rows
+    sequence: int
     content: bytes | None = None
 
 
@@ -133,7 +132,9 @@ class KeptFile:
     def __init__(self, table: KeptTable) -> None:
         self._table = table
         self._rows_at = lru_cache(1)(lambda state: rows_of(table.session))
-        self._opening = Pending[tuple[Asker, Packet]]()
+        self._open: dict[Hashable, _OpenFile] = {}
+        self._opening: set[Hashable] = set()
+        self._uploads: set[Hashable] = set()
 
     def take(self, asker: Asker, payload: bytes, route: Callable[[], None]) -> bool:
         """Answer a request; return False for one that the vehicle has to answer.
@@ -143,68 +144,63 @@ class KeptFile:
             payload: of the message.
             route: passes the request to the vehicle.
         """
-        request, files = Packet.unpack(payload), asker.station.files
-        key = (self, asker.system, asker.component, request.session)
+        request = Packet.unpack(payload)
+        key = (asker, request.session)
         match request.opcode:
             case Opcode.OPEN_FILE_RO | Opcode.CALC_FILE_CRC32:
-                return self._begin(asker, request, key, route)
-            case Opcode.READ_FILE | Opcode.BURST_READ_FILE if isinstance(files.get(key), _OpenFile):
-                self._send(asker, request, files[key])
+                return self._begin(asker, request, route)
+            case Opcode.READ_FILE | Opcode.BURST_READ_FILE if key in self._open:
+                self._send(asker, request, self._open[key])
                 return True
-            case Opcode.CREATE_FILE | Opcode.OPEN_FILE_WO:
-                self._keep(asker, key, FileQuery.of(request))
+            case Opcode.CREATE_FILE | Opcode.OPEN_FILE_WO if FileQuery.of(request) is not None:
+                if len(self._uploads) < OPEN_FILES_MAX:
+                    self._uploads.add(key)
             case Opcode.TERMINATE_SESSION | Opcode.RESET_SESSIONS:
-                same = 3 if request.opcode == Opcode.RESET_SESSIONS else 4  # members of the key
-                closed = [files.pop(each) for each in list(files) if each[:same] == key[:same]]
-                if any(isinstance(each, FileQuery) for each in closed):
+                if key in self._uploads:
+                    self._uploads.remove(key)
                     self._table.component.watch.doubt()
-                if closed and all(isinstance(each, _OpenFile) for each in closed):
+                if self._open.pop(key, None) is not None:
                     self._say(asker, reply(request))
                     return True
         return False
 
-    def _keep(self, asker: Asker, key: SessionKey, file: _OpenFile | FileQuery | None) -> None:
-        """Note what a session has open: a file here, or one on the vehicle, with its query in an upload."""
-        files = asker.station.files
-        files.pop(key, None)
-        files[key] = file
-        if len(files) > OPEN_FILES_MAX:
-            del files[next(iter(files))]
-
-    def _begin(self, asker: Asker, request: Packet, key: SessionKey, route: Callable[[], None]) -> bool:
+    def _begin(self, asker: Asker, request: Packet, route: Callable[[], None]) -> bool:
         """Open the file, or answer its checksum; wait for a fetch that may bring the table."""
-        query, file = FileQuery.of(request), asker.station.files.get(key)
-        is_checksum = request.opcode == Opcode.CALC_FILE_CRC32
-        if isinstance(file, _OpenFile) and file.opening == request:
-            self._say(asker, _opened(request, file.rows))
+        key, query = (asker, request.session), FileQuery.of(request)
+        opened = self._open.pop(key, None) if request.opcode == Opcode.OPEN_FILE_RO else None
+        if opened is not None and (opened.query, opened.sequence) == (query, request.sequence):
+            self._open[key] = opened
+            self._say(asker, _opened(request, opened.rows))
             return True
-        if not is_checksum:
-            self._keep(asker, key, None)  # until it is opened here
-        if query is None or not self._is_served or (is_checksum and query.with_defaults):
-            return False  # a vehicle may send a default that is the value, which the table does not keep
+        if query is None or not self._is_served:
+            return False
         if self._table.list_if_current is None:
-            if self._opening.begins((asker, request), asker):
-                self._table.component.core.spawn(self._begin_later, asker, request, key, route)
+            opening = (key, request.opcode, request.sequence)
+            if opening not in self._opening:
+                self._opening.add(opening)
+                self._table.component.core.spawn(self._begin_later, opening, asker, request, route)
             return True
         rows = self._rows_at(self._table.state_key)
         if rows is None or query.start >= len(rows.entries):
             return False
         self._table.check()
-        if is_checksum:
+        if request.opcode == Opcode.CALC_FILE_CRC32:
             checksum = crc32_px4(rows.content(query, CHECKED_READ_SIZE))
             self._say(asker, reply(request, checksum.to_bytes(4, "little")))
             return True
-        self._keep(asker, key, _OpenFile(request, query, rows))
+        self._open[key] = _OpenFile(query, rows, request.sequence)
+        if len(self._open) > OPEN_FILES_MAX:
+            del self._open[next(iter(self._open))]
         self._say(asker, _opened(request, rows))
         return True
 
     async def _begin_later(
-        self, asker: Asker, request: Packet, key: SessionKey, route: Callable[[], None]
+        self, opening: Hashable, asker: Asker, request: Packet, route: Callable[[], None]
     ) -> None:
         with anyio.move_on_after(FILE_WAIT):
             await self._table.load().wait()
-        self._opening.end((asker, request))
-        if self._table.list_if_current is not None and self._begin(asker, request, key, route):
+        self._opening.discard(opening)
+        if self._table.list_if_current is not None and self._begin(asker, request, route):
             return
         if self._table.is_loading and request.opcode == Opcode.OPEN_FILE_RO:
             self._say(asker, reply(request, error=FileErrorCode.FILE_NOT_FOUND))

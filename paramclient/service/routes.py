@@ -485,8 +485,9 @@ def _context(author: str, target: Target) -> dict[str, Any]:
 @reading.get(f"{VEHICLE}/snapshots")
 async def snapshots(target: TargetArgument) -> JsonObject:
     """Return the snapshots, the newest last."""
-    found = await target.cached(ParamCache.snapshots)
-    return {"snapshots": [json_output.snapshot_json(each) for each in found]}
+    return {
+        "snapshots": [json_output.snapshot_json(each) for each in await target.cached(ParamCache.snapshots)]
+    }
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
@@ -495,8 +496,9 @@ async def create_snapshot(target: TargetArgument, body: SnapshotRequest) -> Json
     if not target.component.params:
         raise UsageError("no parameter of the vehicle is known")
     await target.component.core.cache_writer.write_all()
-    stored = await target.cached(partial(ParamCache.store_snapshot, reason=body.reason))
-    return json_output.snapshot_json(stored)
+    return json_output.snapshot_json(
+        await target.cached(partial(ParamCache.store_snapshot, reason=body.reason))
+    )
 
 
 @reading.get(f"{VEHICLE}/history")
