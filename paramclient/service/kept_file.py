@@ -174,6 +174,8 @@ class KeptFile:
             return True
         if query is None or not self._is_served:
             return False
+        if request.opcode == Opcode.CALC_FILE_CRC32 and query.with_defaults:
+            return False  # a vehicle may send a default that is the value, which the table does not keep
         if self._table.list_if_current is None:
             opening = (key, request.opcode, request.sequence)
             if opening not in self._opening:
