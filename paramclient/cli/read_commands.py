@@ -85,7 +85,7 @@ async def fetch(
                 for param in params
                 if param.name in kept and (not changed or _is_changed(param, defaults[param.name]))
             ]
-            return _Fetched(session, result, params, known, shows_defaults=changed)
+            return _Fetched(session, result, params, known, defaults if changed else {})
 
         done = await found.work(work)
     return found.show(done)
@@ -132,7 +132,7 @@ class _Fetched:
         result: the fetch.
         params: the parameters.
         metadata: the metadata of the vehicle for its defaults, or None.
-        shows_defaults: whether the table has the defaults.
+        defaults: the defaults of the parameters by name, if the table is to show them.
     """
 
     columns: ClassVar[Sequence[str]] = ("name", "value", "type", "index", "trust", "default")
@@ -141,7 +141,7 @@ class _Fetched:
     result: FetchResult
     params: list[Param]
     metadata: Metadata | None
-    shows_defaults: bool
+    defaults: Mapping[str, Default | None]
 
     def report(self) -> int:
         """Print notes, a summary, and what is missing; return the exit code."""
@@ -149,8 +149,8 @@ class _Fetched:
         for note in result.notes:
             report(f"{session.prefix}{note}")
         if not session.options.json:
-            if self.shows_defaults:
-                say_sources(session.label, (default_in(self.metadata, param) for param in self.params))
+            if self.defaults:
+                say_sources(session.label, (self.defaults[param.name] for param in self.params))
             say(self._summary)
         if not result.missing:
             return ExitCode.DONE
@@ -183,7 +183,7 @@ class _Fetched:
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the cells of each parameter."""
         for param in self.params:
-            default = default_in(self.metadata, param) if self.shows_defaults else None
+            default = self.defaults.get(param.name)
             value, kind = format_value(param.settable, param.type), param.type.name
             changed = default and format_value(default.value, param.type)
             yield param.name, value, kind, param.index, param.trust, changed

@@ -7,8 +7,8 @@ between their ends differ. Where one value does, its new bits follow from each r
 row in which these are a simple value is probably the one.
 
 Such a value can also make up for other changes, and no checksum would show it. So each is read by its index
-too, but for those that always move: these are searched alone. Nothing is taken over until the
-checksum of the whole file agrees.
+too, but for those that always move: their rows are compared alone. Nothing is taken over until the checksum
+of the whole file agrees.
 """
 
 from __future__ import annotations
@@ -145,12 +145,9 @@ class _Proof:
         """
         rows, volatile = self._rows, self._session.table.volatile
         whole = range(len(rows))
-        measures_pressure = self._session.identification.vehicle_type in PLANES_AND_ROVERS
-        always = {
-            at
-            for at, row in enumerate(rows)
-            if measures_pressure and row.bits and PRESSURE.fullmatch(row.name)
-        }
+        always: set[int] = set()
+        if self._session.identification.vehicle_type in PLANES_AND_ROVERS:
+            always = {at for at, row in enumerate(rows) if row.bits and PRESSURE.fullmatch(row.name)}
         seconds = {at for at, row in enumerate(rows) if SECONDS.fullmatch(row.name)}
         often = {at for at, row in enumerate(rows) if row.name in volatile} - always - seconds
         rare = {at for at, row in enumerate(rows) if row.name == BOOT_COUNT or may_be_rounded(row)}

@@ -18,8 +18,9 @@ M = TypeVar("M")
 REBOOT_SILENCE = 0.2
 """Seconds without a message that a rebooting vehicle is off, at least: an ArduPilot is off 0.2 to 0.3 s after
 its acknowledgement (measured)."""
-HEARTBEAT_INTERVAL = 1.0
-"""Seconds between two messages of a vehicle at least."""
+OFF_SILENCE = 1.0
+"""Seconds without a message after which a vehicle that did not acknowledge is off: a running one sends a
+heartbeat in each."""
 PRESENCE_INTERVAL = 0.02
 """Seconds between two looks at the presence of a vehicle that reboots."""
 SAVING_TIME = 2.5
@@ -104,7 +105,7 @@ async def reboot(node: Node, *, returns: bool = True) -> None:
     try:
         await send_command(channel, command)
     except NoReply:  # if the vehicle is silent too, it is off, and the acknowledgement was lost
-        if not has_rebooted() and anyio.current_time() - presence.received_at < HEARTBEAT_INTERVAL:
+        if not has_rebooted() and anyio.current_time() - presence.received_at < OFF_SILENCE:
             raise
     with channel.gate.until_closed():
         await _until(lambda: has_rebooted() or anyio.current_time() - presence.received_at >= REBOOT_SILENCE)
