@@ -167,6 +167,19 @@ def test_values_are_staged_reviewed_sent_and_undone(bench: Bench, visit: Callabl
     assert value_of(bench, "RTL_ALT", "ardupilot") == before
 
 
+def test_a_press_before_the_rows_are_sorted_is_a_click(bench: Bench, visit: Callable[..., Sight]) -> None:
+    """They are sorted for screen readers a moment after a scroll, and an element that moves is not clicked."""
+    sight = visit(bench.url)
+    cell = sight.page.locator("#rows .row .value").nth(5).bounding_box()
+    assert cell is not None
+    sight.page.mouse.move(cell["x"] + 5, cell["y"] + 5)
+    sight.grid.evaluate("grid => { grid.scrollTop = 4000; }")
+    sight.page.mouse.down()
+    sight.page.wait_for_timeout(300)
+    sight.page.mouse.up()
+    expect(sight.editor).to_be_visible()
+
+
 def test_a_value_out_of_range_needs_a_confirmation(bench: Bench, visit: Callable[..., Sight]) -> None:
     sight = visit(bench.url)
     high = bench.ask("GET", "/vehicles/1/1/params/MC_ROLL_P")["metadata"]["maximum"] + 1

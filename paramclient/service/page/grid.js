@@ -91,6 +91,7 @@ export class Grid {
 
   /** After scrolling, sorts the elements for screen readers. */
   settle() {
+    if (this.body.matches(":active")) return this.draw(false); // a pressed row that moves in the DOM is not clicked
     const wanted = [...this.made].sort(([a], [b]) => a - b).map(([, made]) => made.row);
     if (wanted.some((row, place) => this.body.children[place] !== row)) this.body.prepend(...wanted);
   }
