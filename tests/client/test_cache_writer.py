@@ -368,20 +368,6 @@ async def test_a_change_by_another_station_is_in_the_history_with_its_address(pa
     assert (await session(vehicle, path)).source == "cache"
 
 
-async def test_a_table_is_never_called_whole_that_is_not(path: Path) -> None:
-    vehicle = PX4Vehicle(burst=1, period=0.05, table=VALUES)
-    async with connected(vehicle, cache=path) as (_, component):
-        assert not (await component.fetch_all(timeout=0.6)).complete
-    with ParamCache(path) as cache:
-        cached = cache.component()
-        assert 5 < len(cached.params) < 20
-        assert not cached.complete
-        assert cached.hash is None
-        assert cached.count == 24
-    result = await session(vehicle, path)
-    assert (result.source, result.complete) == ("stream", True)
-
-
 # With it, and without
 
 
@@ -461,16 +447,6 @@ async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Pa
     assert len(kept(path)) == 1382
     assert (await session(vehicle, path)).source == "cache", "the checksum proves values, not defaults"
     assert said(path) == (0, None)
-
-
-async def test_names_that_change_by_themselves_are_learnt_for_later_sessions(path: Path) -> None:
-    vehicle = ArduPilotVehicle(live_period=0)
-    await session(vehicle, path)
-    vehicle.load({"RTL_ALT": 2100, "STAT_RUNTIME": 60})
-    assert (await session(vehicle, path)).changed == ("RTL_ALT",)
-    async with connected(vehicle, cache=path) as (_, component):
-        assert component.session.table.volatile == {"RTL_ALT", "STAT_RUNTIME"}
-        assert (await component.fetch_all()).source == "cache"
 
 
 @pytest.mark.parametrize("kind", ["no file", "silent"])

@@ -15,7 +15,7 @@ import anyio
 import anyio.abc
 import pytest
 
-from paramclient import Change, Changes, Component, Encoding, ParamClient, ParamType, Progress, errors
+from paramclient import Change, Changes, Component, ParamClient, ParamType, Progress, errors
 from paramclient.client import link_task
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire import messages
@@ -127,21 +127,6 @@ async def test_calls_on_a_client_that_is_not_open() -> None:
     assert not residue(component)
 
 
-async def test_closing_while_the_link_is_disconnected() -> None:
-    tap = Tap(generic())
-    link = FlakyLink(tap)
-    async with connected(link) as (client, component):
-        tap.is_mute = True
-        waiting = under_way(client, component)
-        await settled()
-        await link.drop(stays_offline=True)
-        await asyncio.sleep(1.0)
-        assert not any(task.done() for task in waiting.values())
-    for name, task in waiting.items():
-        assert type(await task) is errors.ClientClosed, name
-    assert not tasks_beside()
-
-
 LONG_CALLS: dict[str, Call] = {
     "settle": lambda client, component: component.set("MC_ROLL_P", 5.0, settle=60),
     "fetch": lambda client, component: component.fetch_all(refresh=True),
@@ -193,13 +178,6 @@ async def test_nothing_is_left_behind(tmp_path: Path) -> None:
 
 
 # On the link
-
-
-async def test_the_user_knows_better_how_values_are_laid_out() -> None:
-    async with connected(generic(), encoding=Encoding.C_CAST) as (_, component):
-        assert component.encoding is Encoding.C_CAST
-        assert component.encoding_reason == "chosen by the user"
-        assert (await component.get("PARAM_01")).value == 0, "1 as the bits of a float32 is next to nothing"
 
 
 async def test_bytes_are_counted_both_ways() -> None:
@@ -494,15 +472,3 @@ async def test_a_blocked_program_processes_received_data_before_timeouts_count()
         result = await vehicle.fetch_all()
     assert result.complete
     assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, 0)
-
-
-async def test_a_vehicle_that_receives_nothing_at_first_is_identified_later() -> None:
-    tap = Tap(PX4Vehicle())
-    tap.is_deaf = True
-    async with connected(tap) as (_, component):
-        await anyio.sleep(300.0)
-        assert component.identity.uid is None
-        tap.is_deaf = False
-        assert (await component.get("SYS_AUTOSTART")).value
-        await anyio.sleep(0.2)
-        assert component.identity.key.startswith("uid:")

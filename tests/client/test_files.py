@@ -12,9 +12,8 @@ import pytest
 from paramclient import ClientClosed, NoReply
 from paramclient.errors import LinkError
 from paramclient.links import SimLink
-from paramclient.model.values import ParamType
-from paramclient.sim import Air, ArduPilotVehicle, SimParam
-from tests.client.conftest import connected, fetched
+from paramclient.sim import Air, ArduPilotVehicle
+from tests.client.conftest import connected
 from tests.shell import FlakyLink, Tap, outcome, tasks_beside
 
 LOG = bytes(range(256)) * 200
@@ -134,13 +133,3 @@ async def test_a_read_goes_on_when_the_link_is_back() -> None:
         await anyio.sleep(0.3)
         await link.drop()
         assert await reading == LOG
-
-
-async def test_a_neighbour_of_a_large_integer_can_be_set() -> None:
-    big = (1 << 24) + 1
-    vehicle = ArduPilotVehicle(table=[SimParam("BIG", ParamType.INT32, big)], live_period=0)
-    async with fetched(vehicle) as (_, component):
-        assert component.params["BIG"].value == big
-        result = await component.set("BIG", big - 1)
-        assert (result.status, result.actual) == ("accepted", big - 1)
-        assert component.params["BIG"].value == vehicle.params["BIG"].value == big - 1

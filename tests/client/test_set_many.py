@@ -93,31 +93,6 @@ async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], m
         assert not tap.messages(messages.ParamSet)
 
 
-async def test_values_are_watched_while_others_are_written() -> None:
-    vehicle = PX4Vehicle(table=MANY)
-    async with fetched(Air.symmetric([vehicle], delay=0.05)) as (_, component):
-        result = await component.set_many(NEW, settle=1.2)
-        assert result.is_complete
-        assert 1.2 < result.elapsed < 4.0
-        assert not residue(component)
-
-
-async def test_an_error_of_progress_cancels_the_call() -> None:
-    tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
-
-    def fail(outcome: SetOutcome) -> None:
-        raise RuntimeError(outcome.name)
-
-    async with fetched(tap) as (_, component):
-        with pytest.raises(RuntimeError, match="MANY_000"):
-            await component.set_many(NEW, progress=fail)
-        assert not residue(component)
-        await asyncio.sleep(0.1)  # what was to be sent already is sent
-        sent = len(tap.messages(messages.ParamSet))
-        await asyncio.sleep(1.0)
-        assert len(tap.messages(messages.ParamSet)) == sent < 60
-
-
 async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Path) -> None:
     async with fetched(small_px4(), cache=tmp_path / "cache") as (_, component):
         assert (await component.set_many({"PARAM_01": 2}, durable=True)).is_complete

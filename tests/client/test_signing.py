@@ -14,9 +14,9 @@ import paramclient
 from paramclient import NoReply, ParamClient, Signing, SigningKey, SigningPolicy, UsageError, read_key
 from paramclient.client import signing
 from paramclient.client.signing import key_from_environment
-from paramclient.sim import ArduPilotVehicle, Vehicle
+from paramclient.sim import Vehicle
 from paramclient.wire.signing import UNITS_PER_SECOND, Refusal
-from tests.shell import VALUES, in_simulated_time, small_px4
+from tests.shell import in_simulated_time, small_px4
 
 SECRET = bytes(range(101, 133))
 KEY = SigningKey(SECRET)
@@ -153,22 +153,6 @@ async def test_no_reply_says_that_frames_were_refused() -> None:
         report = client.signing_report()
         assert report is not None
         assert report.refused.keys() == {Refusal.UNSIGNED}
-
-
-async def test_a_key_is_sent_only_if_the_caller_says_that_the_link_is_safe() -> None:
-    vehicle = ArduPilotVehicle(table=VALUES)
-    async with a_client(vehicle, signing=None) as client:
-        component = await client.component()
-        with pytest.raises(UsageError, match="sends the key unencrypted"):
-            await component.setup_signing(KEY)
-        assert vehicle.requests["SETUP_SIGNING"] == 0
-        await component.setup_signing(KEY, link_is_safe=True)
-    assert vehicle.signing_key == KEY
-    async with a_client(vehicle) as client:
-        component = await client.component()
-        assert (await component.fetch_all()).complete
-        await component.setup_signing(None, link_is_safe=True)
-    assert vehicle.signing_key is None
 
 
 async def test_a_vehicle_of_mavlink_1_is_given_no_key_and_is_answered_unsigned() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from pathlib import Path
 
 import anyio
@@ -23,10 +23,17 @@ from paramclient import (
     Trust,
     errors,
 )
-from paramclient.model.values import ParamType
+from paramclient.model.values import ParamType, Value
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import frames
-from paramclient.wire.messages import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
+from paramclient.wire.messages import (
+    HASH_CHECK,
+    Heartbeat,
+    ParamRequestList,
+    ParamRequestRead,
+    ParamSet,
+    encode,
+)
 from tests.client.conftest import connected, fetched, table_in
 from tests.conversations.test_fetch import new_vehicle
 from tests.conversations.virtual import Silence
@@ -45,6 +52,7 @@ from tests.shell import (
 )
 
 VOLATILE = {"CAL_ACC0_XOFF", "PARAM_03"}
+TIME_MAX = 7.0
 MISSES = (ParamRequestRead, ParamRequestList, ParamSet)
 
 
@@ -117,10 +125,11 @@ async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
         assert not px4.messages(ParamRequestList), "nor one for the other vehicle"
 
 
-async def test_parameters_that_appear_and_go_do_so_in_the_cache_too(path: Path) -> None:
+@pytest.mark.parametrize("ftp", [True, False])
+async def test_parameters_that_appear_and_go_do_so_in_the_cache_too(path: Path, ftp: bool) -> None:
     group = {f"GRIP_{number}": number for number in range(5)}
     table = {**VALUES, "GRIP_ENABLE": 0}
-    vehicle = ArduPilotVehicle(table=table, groups={"GRIP_ENABLE": group}, ftp=False, live=())
+    vehicle = ArduPilotVehicle(table=table, groups={"GRIP_ENABLE": group}, ftp=ftp, live=())
     async with fetched(vehicle, cache=path) as (_, component):
         changes = component.changes()
         for is_enabled in (1, 0):
@@ -147,13 +156,74 @@ def test_an_interval_that_cannot_be(wrong: float) -> None:
         ParamClient("sim:px4", watch_interval=wrong)
 
 
+async def test_an_armed_vehicle_is_asked_only_after_a_sign_of_change() -> None:
+    tap = Tap(vehicle := PX4Vehicle())
+    async with fetched(tap, watch_interval=5.0) as (_, component):
+        vehicle.armed = True
+        await anyio.sleep(6.5)
+        before = requested(tap)
+        await anyio.sleep(30.0)
+        assert requested(tap) == before
+        vehicle.set_param("CAL_MAG2_ID", 197388)  # brings more into use
+        await anyio.sleep(0.1)
+        vehicle.set_param("MC_ROLL_P", 3.0)  # its value has the new count
+        await anyio.sleep(5.0)
+        assert requested(tap) > before
+        assert "CAL_MAG2_ROT" in component.params
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "seconds", "interval"),
+    [(generic, "PARAM_03", 35.0, 30.0), (PX4Vehicle, "CAL_MAG0_XOFF", 160.0, None)],
+    ids=["by downloads, if the user wants it", "outside a hash, every two minutes"],
+)
+async def test_what_no_hash_confirms_is_watched(
+    make: Callable[[], Vehicle], name: str, seconds: float, interval: float | None
+) -> None:
+    """The vehicle's announcement of the new value was lost."""
+    tap = Tap(vehicle := make())
+    async with fetched(tap, watch_interval=interval) as (client, component):
+        events = client.events()
+        tap.is_mute = True
+        vehicle.set_param(name, 0.0625)
+        await anyio.sleep(0.5)
+        tap.is_mute = False
+        before = requested(tap)
+        await anyio.sleep(seconds)
+        assert interval or requested(tap) - before <= 80
+        assert component.params[name].value == 0.0625
+        assert [event.changed for event in await drained(events)] == [(name,)]
+
+
+async def test_a_table_that_is_known_to_differ_is_not_called_synced_while_it_is_fetched() -> None:
+    vehicle = PX4Vehicle()
+    async with fetched(Air.symmetric([vehicle], delay=0.1), watch_interval=10.0) as (_, component):
+        vehicle.load({"MC_ROLL_P": 3.25})
+        while component.params["MC_ROLL_P"].value != 3.25:
+            is_fetching = component.session.fetching.is_running
+            assert component.sync_state is (SyncState.CHECKING if is_fetching else SyncState.SYNCED)
+            await anyio.sleep(0.05)
+
+
+async def test_a_list_for_another_station_is_taken_and_restarts_nothing() -> None:
+    tap = Tap(vehicle := small_px4())
+    async with fetched(tap, watch_interval=0) as (_, component):
+        vehicle.load({"PARAM_01": 1001})
+        before = requested(tap)
+        request = encode(ParamRequestList(1, 1), system=254, component=190, sequence=0)
+        vehicle.receive(request, anyio.current_time())
+        await anyio.sleep(100.0)
+        assert requested(tap) == before
+        assert component.params["PARAM_01"].value == 1001
+
+
 # lost and found
 
 
 async def test_lost_and_found() -> None:
     vehicle = small_px4()
     tap = Tap(vehicle)
-    async with fetched(tap) as (client, component):
+    async with fetched(tap, watch_interval=5.0) as (client, component):
         events = client.events()
         tap.is_mute = tap.is_deaf = True
         with anyio.fail_after(7.0):
@@ -167,6 +237,9 @@ async def test_lost_and_found() -> None:
         assert {param.trust for param in component.params.values()} == {Trust.CACHED}
         with anyio.fail_after(3.0), pytest.raises(errors.NoReply):
             await component.get("PARAM_01")
+        tap.received.clear()
+        await anyio.sleep(60.0)
+        assert len(tap.received) == len(tap.messages(Heartbeat)) == 60
         tap.is_mute = tap.is_deaf = False
         with anyio.fail_after(2.0):
             found = await anext(events)
@@ -410,95 +483,68 @@ async def test_a_durable_write_to_a_vehicle_that_does_not_say_who_it_is_is_not_s
         assert stranger.param("PARAM_01").value == 1
 
 
-TIME_MAX = 7.0
-
-
-class World:
-    """A vehicle on a link with a delay each way, which goes silent when a condition holds."""
-
-    def __init__(self, kind: str, delay: float = 0.05) -> None:
-        self.vehicle: Vehicle = new_vehicle(kind)
-        self.endpoint = Silence(Air.symmetric([self.vehicle], delay=delay), at=1e9)
-        # those that no rule of a firmware limits, moves or protects
-        names = [each.name for each in self.vehicle.listed if each.type is ParamType.REAL32]
-        ruled = ("MPC", "LNDMC", "BARO", "STAT", "MIS_", "INS")
-        free = [name for name in names if not name.startswith(ruled)][:150]
-        self.wanted = {name: 0.25 + number for number, name in enumerate(free)}
-
-    async def until_silent(self, is_due: Callable[[], bool], call: Callable[[], Awaitable[object]]) -> None:
-        """Run a call; check that it ends in time after the vehicle went silent."""
-
-        async def watch() -> None:
-            while not is_due():  # noqa: ASYNC110 - in simulated time
-                await anyio.sleep(0.01)
-            self.endpoint.at = anyio.current_time()
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(watch)
-            await call()
-            assert self.endpoint.at <= anyio.current_time() < self.endpoint.at + TIME_MAX
+def silent_on(kind: str, delay: float = 0.05) -> tuple[Vehicle, Silence, dict[str, Value]]:
+    """A vehicle, its link, on which it can go silent, and new values that no firmware limits."""
+    vehicle = new_vehicle(kind)
+    names = [each.name for each in vehicle.listed if each.type is ParamType.REAL32]
+    ruled = ("MPC", "LNDMC", "BARO", "STAT", "MIS_", "INS")
+    free = [name for name in names if not name.startswith(ruled)][:150]
+    endpoint = Silence(Air.symmetric([vehicle], delay=delay), at=1e9)
+    return vehicle, endpoint, {name: 0.25 + number for number, name in enumerate(free)}
 
 
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
-async def test_a_vehicle_that_is_lost_ends_a_refresh(kind: str, tmp_path: Path) -> None:
-    world = World(kind)
-    cache = tmp_path / "cache.sqlite3"
-    async with ParamClient(world.endpoint, cache=cache) as client:
-        count = (await (await client.component()).fetch_all()).count
-    synced_at = table_in(cache, system=1).synced_at
-    received = [0]
-    assert isinstance(world.vehicle, PX4Vehicle | ArduPilotVehicle)
-    world.vehicle.load(world.wanted)
-    async with connected(world.endpoint, cache=cache) as (_, component):
+@pytest.mark.parametrize("known", [False, True], ids=["new", "known"])
+async def test_a_vehicle_that_is_lost_ends_a_fetch_with_what_came(kind: str, known: bool, path: Path) -> None:
+    vehicle, endpoint, wanted = silent_on(kind)
+    synced_at = None
+    if known:
+        async with fetched(endpoint, cache=path):
+            pass
+        synced_at = table_in(path, system=1).synced_at
+        for name, value in wanted.items():
+            vehicle.set_param(name, value)
+    async with connected(endpoint, cache=path) as (_, component):
         await anyio.sleep(2.0)
-
-        async def call() -> None:
-            result = await component.fetch_all(
-                refresh=True, progress=lambda each: received.append(each.received)
-            )
-            assert not result.complete
-            assert result.hash is None
-            assert (result.count, len(result.params)) == (count, count)
-            assert {result.params[name].index for name in result.cached} == set(result.missing)
-            assert 50 < result.received == count - len(result.cached)
-            wrong = {
-                name
-                for name, param in result.params.items()
-                if not param.same_value(world.vehicle.param(name))
-            }
-            assert wrong <= set(result.cached)
-
-        began = anyio.current_time()
-        await world.until_silent(lambda: received[-1] > 120 or anyio.current_time() > began + 0.3, call)
-        world.endpoint.at = 1e9
+        endpoint.at = anyio.current_time() + 0.45
+        result = await component.fetch_all(refresh=known)
+        assert anyio.current_time() < endpoint.at + TIME_MAX
+        assert (result.complete, result.hash) == (False, None)
+        assert "The component was lost." in result.notes
+        assert 50 < result.received == len(result.params) - len(result.cached) < result.count
+        assert (len(result.params) == result.count) is known
+        assert {result.params[name].index for name in result.cached} == (
+            set(result.missing) if known else set()
+        )
+        values = result.params.items()
+        assert {name for name, each in values if not each.same_value(vehicle.param(name))} <= set(
+            result.cached
+        )
+        endpoint.at = 1e9
         await anyio.sleep(2.0)
-        assert (component.state, component.sync_state) == ("cached", SyncState.UNSYNCED)
-    assert table_in(cache, system=1).synced_at == synced_at
+        assert component.sync_state is SyncState.UNSYNCED
+    assert table_in(path, system=1).synced_at == synced_at
 
 
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list", "generic"])
 @pytest.mark.parametrize("delay", [0.05, 1.25])
-async def test_a_vehicle_that_is_lost_ends_set_many(kind: str, delay: float, tmp_path: Path) -> None:
-    world = World(kind, delay)
-    cache = tmp_path / "cache.sqlite3"
-    async with fetched(world.endpoint, cache=cache) as (_, component):
-        accepted: set[str] = set()
-        seen: list[SetOutcome] = []
+async def test_a_vehicle_that_is_lost_ends_set_many(kind: str, delay: float, path: Path) -> None:
+    vehicle, endpoint, wanted = silent_on(kind, delay)
+    seen: list[SetOutcome] = []
 
-        async def call() -> None:
-            result = await component.set_many(world.wanted, progress=seen.append)
-            assert isinstance(result.error, errors.NoReply)
-            assert sorted(each.name for each in seen) == sorted(world.wanted)
-            assert {each.status for each in result.outcomes} == {
-                *(SetStatus.ACCEPTED, SetStatus.UNKNOWN, SetStatus.NOT_TRIED)
-            }
-            assert all(each.is_set is (each.error is None) for each in result.outcomes)
-            assert delay > 1.0 or 1 <= result.counts[SetStatus.UNKNOWN] <= 20
-            accepted.update(each.name for each in result.outcomes if each.status is SetStatus.ACCEPTED)
+    def fall_silent(outcome: SetOutcome) -> None:
+        seen.append(outcome)
+        if len(seen) == 20:
+            endpoint.at = anyio.current_time()
 
-        await world.until_silent(lambda: world.vehicle.requests["PARAM_SET"] >= 40, call)
-    assert len(accepted) >= 10
-    params = table_in(cache, system=1).params
-    for name in accepted:
-        value = world.wanted[name]
-        assert value == params[name].value == component.params[name].value == world.vehicle.param(name).value
+    async with fetched(endpoint, cache=path) as (_, component):
+        result = await component.set_many(wanted, progress=fall_silent)
+        assert anyio.current_time() < endpoint.at + TIME_MAX
+        assert isinstance(result.error, errors.NoReply)
+        assert sorted(each.name for each in seen) == sorted(wanted)
+        assert result.counts.keys() == {SetStatus.ACCEPTED, SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
+        assert all(each.is_set is (each.error is None) for each in result.outcomes)
+        assert delay > 1.0 or 1 <= result.counts[SetStatus.UNKNOWN] <= 20
+    params = table_in(path, system=1).params
+    for name in (each.name for each in result.outcomes if each.status is SetStatus.ACCEPTED):
+        assert wanted[name] == params[name].value == component.params[name].value == vehicle.param(name).value

@@ -98,23 +98,6 @@ async def test_a_refresh_downloads_also_where_the_hash_is_being_asked() -> None:
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 2
 
 
-@pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
-@virtual_on_both
-async def test_a_lost_vehicle_ends_a_fetch_within_7_s_with_what_came(kind: str) -> None:
-    vehicle = new_vehicle(kind)
-    endpoint = Silence(Air.symmetric([vehicle], delay=0.05), at=1e9)
-    async with talking(endpoint) as (_, session):
-        await session.identification.settled()
-        if kind == "list":
-            session.serves_file = False
-        endpoint.at = anyio.current_time() + 0.45
-        result = await fetch_all(session)
-        assert anyio.current_time() - endpoint.at < 7.0
-        assert 50 < result.received < result.count
-        assert len(result.params) == result.received
-        assert "The component was lost." in result.notes
-
-
 @virtual_on_both
 async def test_a_vehicle_that_is_lost_after_its_hash_is_told_as_lost() -> None:
     endpoint = Silence(Air.symmetric([PX4Vehicle()], delay=0.3), at=1e9)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import suppress
 from functools import partial
 from random import Random
 
@@ -17,7 +16,7 @@ from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.ftp import FileCutOff, Opcode, Packet, checksum, path_bytes, read_file
 from paramclient.protocol.param_pck import PackedParam, encode
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
-from paramclient.wire.messages import FileTransfer, Message, ParamRequestList, ParamRequestRead, ParamValue
+from paramclient.wire.messages import FileTransfer, Message, ParamRequestList, ParamValue
 from tests.conversations.virtual import Silence, Tap, losing, talking, virtual_on_both
 
 BOTH = pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
@@ -68,14 +67,6 @@ async def test_files_of_every_size_arrive_whole_and_are_closed(make: Maker, loss
             assert received == sorted(received)
             assert received[-1] >= size
             assert vehicle.open_files == []
-
-
-async def test_blocks_arrive_in_another_order_and_twice() -> None:
-    vehicle = serving(9_000)
-    air = Air.symmetric([vehicle], reorder=0.3, duplicate=0.3, jitter=0.02, delay=0.01, seed=1)
-    async with talking(air) as (_, session):
-        assert await read_file(session.channel, "a.bin") == CONTENT[:9_000]
-        assert vehicle.open_files == []
 
 
 async def test_refusals_say_why_and_leave_nothing_open() -> None:
@@ -170,17 +161,6 @@ async def test_cancelled_at_any_moment_a_session_is_closed_on_board(make: Maker)
             assert anyio.current_time() - began < 3.0
 
 
-async def test_sessions_are_closed_where_packets_are_lost_in_bursts() -> None:
-    vehicle = serving(20_000)
-    air = Air.symmetric([vehicle], loss=0.05, loss_burst=4.0, delay=0.3, seed=5)
-    async with talking(air) as (_, session):
-        for number in range(30):
-            with suppress(NoReply), anyio.move_on_after(number * 0.06):
-                await read_file(session.channel, "a.bin")
-            await anyio.sleep(0.4)  # what was sent last arrives
-            assert vehicle.open_files == []
-
-
 @virtual_on_both
 async def test_uses_of_mavftp_take_turns() -> None:
     vehicle = ArduPilotVehicle()
@@ -235,17 +215,6 @@ async def test_a_file_that_is_not_valid_leads_to_the_list_and_drops_nothing(cont
         assert not second.missing
         assert any("Downloaded as a list" in note for note in second.notes)
         assert not [each for each in conversation.changes if each.kind == "removed"]
-
-
-async def test_a_short_file_replaces_no_table_where_the_indices_begin_at_1() -> None:
-    vehicle = ArduPilotVehicle()
-    tap = Tap(vehicle, up=lambda each: not (isinstance(each, ParamRequestRead) and each.param_index == 0))
-    async with talking(tap) as (_, session):
-        first = await fetch_all(session)
-        serve_file(vehicle, pack_of(vehicle, 10))
-        second = await fetch_all(session, refresh=True)
-        assert (second.source, second.count, second.complete) == ("stream", first.count, True)
-        assert second.params.keys() == first.params.keys()
 
 
 @pytest.mark.parametrize("is_cached", [False, True])

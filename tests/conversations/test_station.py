@@ -18,13 +18,12 @@ from paramclient.protocol.identity import judge_encoding
 from paramclient.protocol.presence import BOOT_CLOCK_WRAP, LOST_AFTER_HIGH_LATENCY, REORDERING_TIME, Presence
 from paramclient.protocol.reads import read
 from paramclient.protocol.selection import find, hint_of_link, only_vehicle
-from paramclient.protocol.watch import Watch
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import messages
 from paramclient.wire.frames import build_frame
 from paramclient.wire.signing import Refusal, Signer, SigningKey, Verifier
-from tests.conversations.virtual import Puppet, Silence, converse, messages_in, talking, virtual_on_both
+from tests.conversations.virtual import Puppet, converse, messages_in, talking, virtual_on_both
 
 PX4 = messages.Heartbeat(2, 12, system_status=4)
 ARDUPILOT = messages.Heartbeat(10, 3, system_status=4)
@@ -172,24 +171,6 @@ async def test_our_heartbeat_is_sent_once_a_second() -> None:
 
 
 # presence
-
-
-@virtual_on_both
-async def test_nothing_is_requested_from_a_lost_component() -> None:
-    endpoint = Silence(ArduPilotVehicle(), at=1e9)
-    async with converse(endpoint) as conversation:
-        node = await conversation.node()
-        await fetch_all(node.plain)
-        watch = Watch(node.plain, node.presence, lambda event: None, interval=5.0)
-        watch.fetched()
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(watch.run)
-            endpoint.at = anyio.current_time()
-            await anyio.sleep(12.0)  # a call that began before may take 5 s more
-            conversation.sent.clear()
-            await anyio.sleep(60.0)
-            tasks.cancel_scope.cancel()
-        assert len(conversation.sent) == len(conversation.sent_of(messages.Heartbeat)) == 60
 
 
 def test_the_heartbeat_timeout_follows_slow_heartbeats_and_satellites() -> None:

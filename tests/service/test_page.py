@@ -168,7 +168,7 @@ def test_values_are_staged_reviewed_sent_and_undone(bench: Bench, visit: Callabl
 
 
 def test_a_press_before_the_rows_are_sorted_is_a_click(bench: Bench, visit: Callable[..., Sight]) -> None:
-    """They are sorted for screen readers a moment after a scroll, and an element that moves is not clicked."""
+    """They are sorted for screen readers after a scroll; the browser clicks no element that has moved."""
     sight = visit(bench.url)
     cell = sight.page.locator("#rows .row .value").nth(5).bounding_box()
     assert cell is not None
