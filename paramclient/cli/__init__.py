@@ -1,9 +1,9 @@
 """The command line: parses arguments, calls the client, and prints tables or JSON.
 
 - `app`: all subcommands, the main function, signals and errors.
-- Subcommands: `read_commands` (fetch, get, watch), `set_command` (set, reset) with `writes`, `apply`
-  (apply, restore), `show` (show, search, info), `cached` (cache, import, history), `save`, `diff`,
-  `metadata`, `link` (link, ports), `check`, `signing` and `serve` (serve, token, sim).
+- Subcommands: `read_commands` (fetch, get, watch), `set_command` (set), `apply` (apply, restore, reset),
+  `show` (show, search, info), `cached` (cache, import, history), `save`, `diff`, `metadata`, `link` (link,
+  ports), `check`, `signing` and `serve` (serve, token, sim).
 - `session`: open links with the vehicles of --vehicle, on which a subcommand works, and the parameters that
   it reads there. `options`: options.
 - `sources`: the parameters that an argument names: of a file, a link or the cache.

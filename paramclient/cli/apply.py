@@ -1,21 +1,28 @@
-"""The subcommands apply and restore: write the values of a file, or an earlier state, to vehicles."""
+"""The subcommands apply, restore and reset: write a file, an earlier state, or the defaults to vehicles."""
 
 from __future__ import annotations
 
-import shlex
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial as bind
-from typing import ClassVar, Final, Self, TypeAlias
+from typing import Annotated, ClassVar, Final, Self, TypeAlias
 
 import anyio
 import anyio.to_thread
+from cyclopts import Parameter
 
 from paramclient.cli.cached import parse_when
 from paramclient.cli.json_output import JsonObject, apply_json, plan_json, row_json, rows_json
-from paramclient.cli.metadata import MetadataChoice, known_of_session
+from paramclient.cli.metadata import (
+    MetadataChoice,
+    default_in,
+    known_of_session,
+    no_defaults,
+    request_from_vehicle,
+    say_sources,
+)
 from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import (
     LINE_NAMES_MAX,
@@ -25,17 +32,26 @@ from paramclient.cli.output import (
     can_ask,
     code_of,
     confirm,
-    local_time,
     report,
     say,
 )
-from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
+from paramclient.cli.session import ChosenVehicle, CommandSession, check_given, get_chosen, sessions
+from paramclient.cli.set_command import STYLES, write_all
 from paramclient.cli.sources import check_pattern, described, fill_pattern, is_pattern_name, resolve_all
-from paramclient.cli.writes import STYLES, write_all
-from paramclient.errors import CacheError, FileError, NoReply, NotInCache, UnknownVehicle, UsageError
+from paramclient.errors import (
+    CacheError,
+    FileError,
+    NoReply,
+    NotInCache,
+    UnknownVehicle,
+    UsageError,
+    VehicleError,
+)
 from paramclient.files import FileFormat, ParamFile
-from paramclient.model.names import age_in_words, first_of
+from paramclient.metadata import Metadata
+from paramclient.model.names import age_in_words, counted, first_of, is_pattern
 from paramclient.model.paramset import ParamSet
+from paramclient.model.values import Param
 from paramclient.provision.apply_restore import load_restore_point, restore_categories
 from paramclient.provision.apply_rules import CATEGORIES, READ_ONLY
 from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
@@ -46,7 +62,26 @@ from paramclient.provision.sources import choose, is_file, read_source
 
 _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be revealed"}
 """Words for planned actions in the summary, where they differ from the status."""
+_INCLUDABLE: Final = frozenset(CATEGORIES) - {READ_ONLY}
+"""Categories of left-out parameters that --include writes; the vehicle lets no client write the others."""
 _OPTIONS: Final = ApplyFlags()
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """The values to write to one vehicle.
+
+    Attributes:
+        params: the values.
+        is_part: whether values are missing, so that the command cannot end as complete.
+    """
+
+    params: ParamSet
+    is_part: bool = False
+
+
+Load: TypeAlias = Callable[[CommandSession], Awaitable[State]]
+"""Returns the values for a vehicle."""
 
 
 async def apply(
@@ -77,9 +112,8 @@ async def apply(
         metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for the
             ranges of values, and for parameters that take effect only after a reboot.
     """
-    source = await _read(file, options)
-    load = bind(_from_file, file, source)
-    return await run(url, _of_kind(options, source), load, metadata=metadata, partial=partial)
+    load, options = await _from_file(file, options)
+    return await _run(url, options, load, metadata=metadata, partial=partial)
 
 
 async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags = _OPTIONS) -> int:
@@ -99,94 +133,87 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
             --snapshots`; or a backup file. Default: the state before the last apply, unless a restore ran
             since then. With --vehicle all, a time, or a backup file with {uid} or {system} in its name.
     """
-    load, flags = bind(_earlier_state, url, None), options
     if when is not None and (is_file(when) or is_pattern_name(when)):
         check_pattern("the backup file", when, options)
-        source = await _read(when, options)
-        load, flags = bind(_from_file, when, source), _of_kind(options, source)
-    elif options.place is False:
+        load, options = await _from_file(when, options)
+        return await _run(url, options, load, is_restore=True)
+    if options.place is False:
+        raise UsageError("earlier states are in the cache, which --no-cache excludes; name a backup file")
+    moment = None if when is None else parse_when(when, time.time())
+    if isinstance(moment, int) and ChosenVehicle.parse(options.vehicle).is_all:
         raise UsageError(
-            "earlier states are in the cache, which --no-cache excludes; leave out --no-cache, or name a "
-            "backup file"
+            f"snapshot {when} is of one vehicle; with --vehicle all, give a time such as '2h ago'"
         )
-    elif when is not None:
-        moment = parse_when(when, time.time())
-        if isinstance(moment, int) and ChosenVehicle.parse(options.vehicle).is_all:
-            raise UsageError(
-                f"snapshot {when} is of one vehicle; with --vehicle all, give a time such as '2h ago'"
-            )
-        load = bind(_earlier_state, url, moment)
+    return await _run(url, options, bind(_earlier_state, moment), is_restore=True)
 
-    async def load_own(session: CommandSession) -> State:
-        state = await load(session)
-        say(f"{session.prefix}the state: {described(state.params)}")
-        return replace(state, include=await restore_categories(session.component, state.params))
 
-    return await run(url, flags, load_own, is_restore=True)
+async def reset(
+    url: str,
+    /,
+    *names: str,
+    all_: Annotated[bool, Parameter(name="--all")] = False,
+    changed: bool = False,
+    metadata: MetadataChoice = None,
+    options: ApplyFlags = _OPTIONS,
+) -> int:
+    """Set parameters to the firmware's defaults, in dependency order, and verify each of them.
+
+    Fetches the table first. ArduPilot, and PX4 from 1.18 on, give the defaults in the parameter file over
+    MAVFTP; defaults that the vehicle does not give are taken from its metadata. The state before is stored,
+    for `restore`. On a terminal, the changes are shown and must be confirmed. If several vehicles are heard,
+    --vehicle must choose one, or all. The exit codes are those of apply; 1 also if a default is not known.
+
+    Args:
+        url: The link.
+        names: The parameters, in upper or lower case, or patterns such as "MC_*".
+        all_: Reset all parameters, except those that apply leaves out: identity, calibration, counters and so
+            on, see --include.
+        changed: The same, without a complaint about single parameters whose default is not known.
+        metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
+    """
+    if bool(names) + all_ + changed != 1:
+        raise UsageError("reset takes names, or --all, or --changed")
+    chosen = check_given(names)
+    load = bind(_defaults, chosen or ["*"], metadata, only_known=changed)
+    flags = replace(options, include=(*options.include, *(name.upper() for name in chosen)))
+    return await _run(url, flags, load, metadata=metadata)
 
 
 # The values to write
 
 
-@dataclass(frozen=True, slots=True)
-class State:
-    """The values to write to one vehicle.
+async def _from_file(name: str, options: ApplyFlags) -> tuple[Load, ApplyFlags]:
+    """Return what gives each vehicle its values of a file, and the options for the kind of its parameters.
 
-    Attributes:
-        params: the values.
-        again: the command that continues after an error; "" for the given one. A restore without a time is
-            refused the second time, and an age is another time later.
-        include: categories that are written, although they are else left out.
-        is_part: whether values are missing, so that the command cannot end as complete.
+    The file may also be a vehicle of the cache or a link; one with placeholders in its name is read for each
+    vehicle. The values count as a vehicle's own if --vehicle or the name of the file has its hardware id, and
+    the file has none.
     """
+    source: ParamFile | None = None
+    if is_file(name):
+        source = read_source(name)
+    elif not is_pattern_name(name):
+        source = ParamFile((*await resolve_all([name], options, writes=True),), FileFormat.JSON, name)
 
-    params: ParamSet
-    again: str = ""
-    include: tuple[str, ...] = ()
-    is_part: bool = False
-
-
-Load: TypeAlias = Callable[[CommandSession], Awaitable[State]]
-"""Returns the values for a vehicle."""
-
-
-async def _read(text: str, options: ApplyFlags) -> ParamFile | None:
-    """Return the values for every vehicle; None for a file name with placeholders: each has its own."""
-    if is_file(text):
-        return read_source(text)
-    if is_pattern_name(text):
-        return None
-    return ParamFile((*await resolve_all([text], options, writes=True),), FileFormat.JSON, text)
-
-
-def _of_kind(options: ApplyFlags, source: ParamFile | None) -> ApplyFlags:
-    """Return the options; with a source of extended parameters, those of the vehicles are meant."""
-    return replace(options, extended=options.extended or (source is not None and source.is_extended))
-
-
-async def _from_file(name: str, source: ParamFile | None, session: CommandSession) -> State:
-    """Return the values for a vehicle; as its own, if its hardware id is named and the file has none.
-
-    The id is named by --vehicle, or in the name of the file.
-
-    Raises:
-        FileError: the file does not exist, or has no parameters for the vehicle.
-    """
-    if source is None:
-        path = await fill_pattern(name, session)
-        source = read_source(path) if is_file(path) else None
-        if source is None:
+    async def load(session: CommandSession) -> State:
+        file, path = source, name
+        if file is None and is_file(path := await fill_pattern(name, session)):
+            file = read_source(path)
+        if file is None:
             raise FileError("no such file", source=path)
-    params = choose(source, session.choice.component, session.component.system)
-    await wait_for_identity(session.component)
-    own, origin = session.component.identity, params.identity
-    is_named = session.choice.uid is not None or (own.uid is not None and own.uid in params.source)
-    if is_named and own.uid is not None and (origin is None or origin.uid is None):
-        params = replace(params, identity=own if origin is None else replace(origin, uid=own.uid))
-    return State(params, is_part=source.left_out > 0)
+        params = choose(file, session.choice.component, session.component.system)
+        await wait_for_identity(session.component)
+        own, origin = session.component.identity, params.identity
+        is_named = session.choice.uid is not None or (own.uid is not None and own.uid in params.source)
+        if is_named and own.uid is not None and (origin is None or origin.uid is None):
+            params = replace(params, identity=own if origin is None else replace(origin, uid=own.uid))
+        return State(params, is_part=file.left_out > 0)
+
+    is_extended = options.extended or (source is not None and source.is_extended)
+    return load, replace(options, extended=is_extended)
 
 
-async def _earlier_state(url: str, moment: float | int | None, session: CommandSession) -> State:
+async def _earlier_state(moment: float | int | None, session: CommandSession) -> State:
     """Return the state at a time, of a snapshot, or without either before the last apply.
 
     Raises:
@@ -197,46 +224,76 @@ async def _earlier_state(url: str, moment: float | int | None, session: CommandS
         raise NotInCache("earlier states are in the cache, which cannot be used")
     await wait_for_identity(vehicle)
     await vehicle.core.cache_writer.write_all()
-    where, extended = (vehicle.identity.key, vehicle.component), vehicle.is_extended
+    place = (vehicle.identity.key, vehicle.component)
+    find = bind(load_restore_point, cache, *place, extended=vehicle.is_extended)
+    read = bind(cache.state_at, *place, extended=vehicle.is_extended)
     try:
         if moment is not None:
-            load = bind(cache.state_at, *where, moment, extended=extended)
-            again = "" if isinstance(moment, int) else _command(url, local_time(moment), session)
-            return State(await anyio.to_thread.run_sync(load), again)
-        find = bind(load_restore_point, cache, *where, extended=extended)
+            return State(await anyio.to_thread.run_sync(read, moment))
         point = await anyio.to_thread.run_sync(find)
-    except UnknownVehicle:  # the vehicle was heard on the link; the user named none of the cache
-        message = f"the cache {cache.place} has no earlier state of {where[0]}, component {where[1]}"
-        raise NotInCache(message) from None
     except NotInCache:
         raise
-    except CacheError as error:
-        raise CacheError(
-            f"nothing was sent, as the earlier state cannot be read: {error}. A backup file can be restored "
-            "without the cache (--no-cache)"
-        ) from error
-    now = time.time()
-    changes = [f"{name} {age_in_words(now - at)} ago" for name, at in point.changes.items()]
-    changed = first_of(changes, LINE_NAMES_MAX) or "nothing, as far as is known"
-    say(
-        f"{session.prefix}the state is that before the last apply, {age_in_words(now - point.at)} ago "
-        f"(snapshot {point.snapshot}); changed since then: {changed}"
-    )
-    return State(point.state, _command(url, point.snapshot, session))
+    except (CacheError, UnknownVehicle) as error:  # the user named no vehicle of the cache
+        problem = f"nothing was sent, as no earlier state can be read: {error}"
+        hint = "A backup file can be restored without the cache (--no-cache)"
+        raise CacheError(f"{problem}. {hint}") from error
+    when = f"{age_in_words(time.time() - point.at)} ago (snapshot {point.snapshot})"
+    changed = first_of([*point.changes], LINE_NAMES_MAX) or "nothing, as far as is known"
+    say(f"{session.prefix}the state is that before the last apply, {when}; changed since then: {changed}")
+    return State(point.state)
 
 
-def _command(url: str, when: object, session: CommandSession) -> str:
-    """Return the command that restores a state of a vehicle, for messages."""
-    vehicle = str(session.component.system) if session.choice.is_all else session.options.vehicle
-    chosen = [] if vehicle is None else ["--vehicle", vehicle]
-    more = ["--extended"] * session.component.is_extended
-    return shlex.join(["paramclient", "restore", url, str(when), *chosen, *more])
+async def _defaults(
+    chosen: Sequence[str], choice: MetadataChoice, session: CommandSession, *, only_known: bool
+) -> State:
+    """Return the firmware's defaults of the chosen parameters.
+
+    Raises:
+        VehicleError: no default is known.
+        ParamClientError: the vehicle has no such parameter, or does not answer.
+    """
+    missing = (await session.fetch()).missing
+    params, errors = await get_chosen(session, chosen, is_fetched=True)
+    for error in errors.values():
+        raise error
+    known = await _described(session, choice, params)
+    found = {param.name: default_in(known, param) for param in params}
+    wanted = {name: default.value for name, default in found.items() if default is not None}
+    if not wanted:
+        raise VehicleError(no_defaults(), *session.component.address)
+    say_sources(session.label, found.values())
+    problems = []
+    if missing and any(map(is_pattern, chosen)):
+        problems.append(f"incomplete: {counted(len(missing), 'parameter')} not received")
+    if (without := [name for name in found if name not in wanted]) and not only_known:
+        listed = first_of(without, LINE_NAMES_MAX)
+        problems.append(f"not written, as their default is not known: {listed}")
+    for problem in problems:
+        report(f"{session.prefix}{problem}")
+    return State(ParamSet(wanted, source="the firmware's defaults"), is_part=bool(problems))
+
+
+async def _described(
+    session: CommandSession, choice: MetadataChoice, params: Sequence[Param]
+) -> Metadata | None:
+    """Return the metadata of the vehicle, or None if there is none.
+
+    Without a choice of the user, it is downloaded only if the vehicle does not give a default.
+    """
+    found = await known_of_session(session, choice)
+    if found is not None or all(param.default is not None for param in params):
+        return found
+    try:
+        return await request_from_vehicle(session)
+    except (UsageError, VehicleError, NoReply) as error:
+        say(f"{session.label} gives no metadata with defaults: {error}")
+        return None
 
 
 # Plans and writes
 
 
-async def run(
+async def _run(
     url: str,
     flags: ApplyFlags,
     load: Load,
@@ -266,9 +323,12 @@ async def run(
         jobs, backups = dict[CommandSession, _Job](), set[str]()
 
         async def prepare(session: CommandSession) -> None:
-            state = await load(session)
+            state, include = await load(session), flags.include
+            if is_restore:
+                say(f"{session.prefix}the state: {described(state.params)}")
+                include += await restore_categories(session.component, state.params)
             options = ApplyOptions(
-                include=(*state.include, *flags.include),
+                include=include,
                 info=await known_of_session(session, metadata),
                 partial=partial,
                 reboot=flags.reboot,
@@ -302,16 +362,14 @@ async def run(
 
 @dataclass(eq=False)
 class _Job:
-    """What apply or restore does with one vehicle: its plan, and what became of it.
+    """What apply, restore or reset does with one vehicle: its plan, and what became of it.
 
     Attributes:
         session: the vehicle.
         state: the values to write.
         options: the options of the run.
         is_restore: whether the values are an earlier state of the vehicle.
-        plan: the plan, until the writes begin.
-        arrived: the outcomes so far.
-        result: the result at the end.
+        found: the plan; while it is written, the outcomes so far; and at the end the result.
     """
 
     columns: ClassVar[Sequence[str]] = ("name", "before", "wanted", "now", "status", "reason")
@@ -320,9 +378,7 @@ class _Job:
     state: State
     options: ApplyOptions
     is_restore: bool
-    plan: Plan | None = None
-    arrived: dict[str, ApplyRow] = field(default_factory=dict)
-    result: ApplyResult | None = None
+    found: Rows = field(default_factory=lambda: Rows({}))
 
     async def make_plan(self) -> Self:
         """Plan before the deadline of the command, and return the job.
@@ -333,79 +389,62 @@ class _Job:
         session, left = self.session, self.session.deadline.left()
         include, info = self.options["include"], self.options["info"]
         with anyio.move_on_after(left):
-            self.plan = await plan(session.component, self.state.params, include=include, info=info)
+            self.found = await plan(session.component, self.state.params, include=include, info=info)
             return self
         raise NoReply(f"the parameters of {session.label}", attempts=0, waited=left or 0.0)
 
     async def write(self) -> Self:
         """Write, and return the job with its result."""
-        session = self.session
+        session, arrived = self.session, dict[str, ApplyRow]()
 
         def update(now: ApplyProgress) -> None:
             if now.row is not None:
-                self.arrived[now.row.name] = now.row
+                arrived[now.row.name] = now.row
                 status.count(now.done, now.total)
 
         async def announce() -> None:
             await session.check_only()
             session.announce_write()
 
-        self.plan = None
+        self.found = Rows(arrived)
         title = f"{'restoring' if self.is_restore else 'setting'} {session.label}"
         more = ApplyOptions(timeout=session.deadline.left(), progress=update, before_writing=announce)
         with Status(f"{title}: waiting for the first response", title) as status:
-            self.result = await run_apply(
+            self.found = await run_apply(
                 session.component, self.state.params, {**self.options, **more}, is_restore=self.is_restore
             )
         return self
 
+    @property
+    def has_work(self) -> bool:
+        """Whether there is a plan that writes something."""
+        made = self.found
+        if not isinstance(made, Plan) or self._is_refused(made):
+            return False
+        return bool(made.to_write) or (self.options["reboot"] and bool(made.awaiting_reboot))
+
+    def _is_refused(self, made: Plan) -> bool:
+        """Return whether the plan has problems, and nothing is written because of them."""
+        return bool(made.problems) and not self.options["partial"]
+
     def as_json(self) -> JsonObject:
         """Return the JSON of the plan or the result; after an interruption, of the outcomes so far."""
-        if self.plan is not None:
-            return plan_json(self.plan, self.session.component)
-        if self.result is not None:
-            return apply_json(self.result, self.session.component)
-        rows = rows_json(self.arrived.values())
+        if isinstance(self.found, Plan):
+            return plan_json(self.found, self.session.component)
+        if isinstance(self.found, ApplyResult):
+            return apply_json(self.found, self.session.component)
+        rows = rows_json(self.found.rows.values())
         return {**self.session.ids, "complete": False, "params": rows, "error": "interrupted"}
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the cells of each row; those of a plan in the order of writing."""
-        shown = self.arrived.values() if self.result is None else self.result.shown_rows
-        if self.plan is not None:
-            yield from self._steps(self.plan)
-            shown = [row for row in self.plan.shown_rows if row.status is not ApplyStatus.SET]
-        for row in shown:
-            yield _cells(row, row.why)
-
-    def _steps(self, made: Plan) -> Iterator[Sequence[object]]:
-        reboots = self.options["reboot"] and bool(made.reboot_for or made.awaiting_reboot)
-        restart = (None, None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots")
-        for stage in made.stages:
+        for stage in self.found.stages if isinstance(self.found, Plan) else ():
             for row in stage.rows:
                 purpose = stage.purpose + (", takes effect after a reboot" if row.needs_reboot else "")
                 yield _cells(row, row.reason or purpose)
-            if reboots and stage.reboot_first:
-                reboots = False
-                yield restart
-        if reboots:
-            yield restart
-
-    @property
-    def open_count(self) -> int:
-        """The number of values that were acknowledged, and not read back."""
-        return sum(row.status is ApplyStatus.UNPROVEN for row in self.arrived.values())
-
-    @property
-    def _is_refused(self) -> bool:
-        """Whether the plan has problems, and nothing is written because of them."""
-        return bool(self.plan and self.plan.problems) and not self.options["partial"]
-
-    @property
-    def has_work(self) -> bool:
-        """Whether the plan writes something."""
-        if self.plan is None or self._is_refused:
-            return False
-        return bool(self.plan.to_write) or (self.options["reboot"] and bool(self.plan.awaiting_reboot))
+        for row in self.found.shown_rows:
+            if row.status is not ApplyStatus.SET:
+                yield _cells(row, row.why)
 
     def report(self) -> int:
         """Print counts, what was left out with the options that write it, and what was not checked.
@@ -413,30 +452,31 @@ class _Job:
         Returns:
             The exit code; of a plan, the one that the command is expected to have.
         """
-        result, label = self.result, self.session.label
-        made = self.plan if result is None else result.plan
-        if made is None:  # interrupted
+        found, label, reboots = self.found, self.session.label, self.options["reboot"]
+        words = ", ".join(f"{count} {_WORDS.get(status, status)}" for status, count in found.counts.items())
+        summary = f"{self.session.receiver}: {words or 'nothing to set'}"
+        if isinstance(found, Plan):
+            made, end, to_reboot = found, "; nothing was sent", found.reboot_for
+            to_reboot += found.awaiting_reboot if reboots else ()
+        elif isinstance(found, ApplyResult):
+            made, end, to_reboot = found.plan, f" in {found.elapsed:.1f} s", found.reboot_required
+        else:  # interrupted
+            say(summary)
             return ExitCode.DONE
-        shown: Rows = made if result is None else result
-        end, reboot_for = "; nothing was sent", () if self.options["reboot"] else made.reboot_for
-        if result is not None:
-            end, reboot_for = f" in {result.elapsed:.1f} s", result.reboot_required
-        words = (f"{count} {_WORDS.get(status, status)}" for status, count in shown.counts.items())
-        say(f"{self.session.receiver}: {', '.join(words) or 'nothing to set'}{end}")
-        left_out = Counter(
-            row.category
-            for row in shown.of(ApplyStatus.SKIPPED)
-            if row.category in CATEGORIES and row.category != READ_ONLY and row.differs
-        )
-        if left_out:
+        say(f"{summary}{end}")
+        skipped = found.of(ApplyStatus.SKIPPED)
+        if left_out := Counter(
+            row.category for row in skipped if row.differs and row.category in _INCLUDABLE
+        ):
             listed = ", ".join(f"{count} {category}" for category, count in left_out.items())
             options = " ".join(f"--include {category}" for category in left_out)
             say(f"{label}: left out: {listed}; to write them: {options}")
         if made.unchecked_note:
             say(f"{label}: {made.unchecked_note}")
-        if reboot_for:
-            say(f"{label}: takes effect after a reboot: {first_of(reboot_for, LINE_NAMES_MAX)}")
-        code = self._report_plan(made) if result is None else self._report_result(result)
+        if to_reboot:
+            verb = "reboots for" if reboots and found is made else "takes effect after a reboot"
+            say(f"{label}: {verb}: {first_of(to_reboot, LINE_NAMES_MAX)}")
+        code = self._report_plan(found) if isinstance(found, Plan) else self._report_result(found)
         return max(code, ExitCode.INCOMPLETE) if self.state.is_part else code
 
     def _report_plan(self, made: Plan) -> int:
@@ -449,7 +489,7 @@ class _Job:
         if self.session.component.is_armed and not self.options["allow_armed"]:
             report(f"{label} is armed; nothing would be set now without --allow-armed")
             code = ExitCode.INCOMPLETE
-        if self._is_refused:
+        if self._is_refused(made):
             names = first_of([*made.problems], LINE_NAMES_MAX)
             report(f"{label}: nothing would be sent without --partial: {names}")
             code = ExitCode.USAGE
@@ -461,15 +501,9 @@ class _Job:
         if result.system != session.component.system:
             say(f"{session.address} is {result.system}/{result.component} now")
         if result.error is not None:
-            report(f"{session.label}: {result.error}; {self.to_continue}")
+            report(f"{session.label}: {result.error}; run it again to continue")
             return max(code_of(result.error), ExitCode.INCOMPLETE)
         return ExitCode.DONE if result.complete else ExitCode.INCOMPLETE
-
-    @property
-    def to_continue(self) -> str:
-        """How to continue after an error, in words."""
-        again = self.state.again
-        return f"to continue: `{again}`" if again else "run it again to continue"
 
 
 def _cells(row: ApplyRow, reason: str) -> Sequence[object]:

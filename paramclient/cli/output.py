@@ -238,6 +238,18 @@ async def confirm(question: str) -> bool:
     return answer.strip().lower() in ("y", "yes")
 
 
+async def require_consent(question: str, otherwise: str) -> None:
+    """Ask a question before something is sent; `otherwise` says how to go on without a terminal.
+
+    Raises:
+        UsageError: the answer is no, or nobody can answer.
+    """
+    if not can_ask():
+        raise errors.UsageError(f"nothing was sent; {otherwise}")
+    if not await confirm(question):
+        raise errors.UsageError("nothing was sent")
+
+
 # The status of a command
 
 

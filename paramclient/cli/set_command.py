@@ -1,42 +1,40 @@
-"""The subcommands set and reset: values of the arguments, and the firmware's defaults."""
+"""The subcommand set; and writes to vehicles, as of set and apply: one job for each, with its outcomes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Final
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, Final, Protocol, Self
 
+import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from paramclient.cli.metadata import (
-    MetadataChoice,
-    default_in,
-    info_of,
-    known_of_session,
-    no_defaults,
-    request_from_vehicle,
-    say_sources,
-)
-from paramclient.cli.options import ApplyFlags, LinkOptions
-from paramclient.cli.output import LINE_NAMES_MAX, can_ask, confirm, report, say
-from paramclient.cli.session import CommandSession, check_given, get_chosen, sessions, spelling
-from paramclient.cli.writes import SetJob, write_all
+from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
+from paramclient.cli.metadata import MetadataChoice, info_of, known_of_session
+from paramclient.cli.options import LinkOptions
+from paramclient.cli.output import LINE_NAMES_MAX, Coloured, Status, code_of, report, require_consent, say
+from paramclient.cli.session import CommandSession, Sessions, Shown, sessions, spelling
 from paramclient.client.component import SETTLE_MAX
-from paramclient.errors import NoReply, ParamClientError, UnknownParameter, UsageError, VehicleError
+from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.metadata.info import ParamInfo, number_of
-from paramclient.model.names import counted, first_of, is_pattern
-from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param, Value, check_name, format_value, parse_ext_value
+from paramclient.model.names import first_of
+from paramclient.model.values import ParamType, Value, check_name, format_value, parse_ext_value
+from paramclient.protocol.set_results import SetOutcome, SetStatus
 
-if TYPE_CHECKING:
-    from paramclient.cli.apply import State
-
+STYLES: Final = {
+    **dict.fromkeys(("set", "accepted"), "green"),
+    **dict.fromkeys(("later", "adjusted", "unproven"), "yellow"),
+    **dict.fromkeys(("invalid", "unknown"), "bold red"),
+    **dict.fromkeys(("skipped", "not tried"), "dim"),
+    "refused": "red",
+}
+"""Styles of the outcomes of a value, and of the planned actions."""
 _DEFAULTS: Final = LinkOptions()
-_APPLY: Final = ApplyFlags()
 
 
 async def set_(
@@ -67,22 +65,17 @@ async def set_(
             ArduPilot.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
     """
-    wanted = _parse_pairs(pairs)
-    if isinstance(metadata, Metadata) and not options.extended:
-        _values(wanted, metadata)
+    texts = _parse_pairs(pairs)
     async with sessions(url, options, writes=True) as found:
-        jobs = [await _prepare(each, wanted, metadata) for each in found]
-        doubts = dict.fromkeys([doubt for job in jobs for doubt in await _doubts(job)])
+        jobs = {each: await _prepare(each, texts, metadata, settle=settle, force=force) for each in found}
+        doubts = dict.fromkeys(doubt for job in jobs.values() for doubt in job.doubts)
         for doubt in doubts:
             report(doubt)
         if doubts and not force:
-            if not can_ask():
-                raise UsageError("nothing was written; --force writes these values all the same")
-            receivers = ", ".join(job.session.receiver for job in jobs)
-            if not await confirm(f"Write these values to {receivers} all the same?"):
-                raise UsageError("nothing was written")
-        ready = {job.session: replace(job, settle=settle, force=force) for job in jobs}
-        return await write_all(found, ready)
+            receivers = ", ".join(session.receiver for session in found)
+            question = f"Write these values to {receivers} all the same?"
+            await require_consent(question, "--force writes these values all the same")
+        return await write_all(found, jobs)
 
 
 def _parse_pairs(words: Sequence[str]) -> dict[str, str]:
@@ -108,47 +101,47 @@ def _parse_pairs(words: Sequence[str]) -> dict[str, str]:
     return pairs
 
 
-async def _prepare(session: CommandSession, wanted: dict[str, str], choice: MetadataChoice) -> SetJob:
+async def _prepare(
+    session: CommandSession, texts: Mapping[str, str], choice: MetadataChoice, *, settle: float, force: bool
+) -> SetJob:
     """Return names and values as the vehicle and its metadata have them.
 
     The types of extended parameters are read, as their texts have values only with them.
 
     Raises:
         UsageError: a text is no value of its parameter.
-        ParamClientError: the type of an extended parameter could not be read.
+        ParamClientError: a type could not be read.
     """
-    component = session.component
-    if component.is_extended:
-        params, errors = await get_chosen(session, [*wanted])
-        for error in errors.values():
-            if not isinstance(error, UnknownParameter):  # the write reports that
-                raise error
-        types = {param.name: param.type for param in params}
-    texts = {spelling(name, component): text for name, text in wanted.items()}
-    if component.is_extended:
-        values = {
-            name: parse_ext_value(name, text, types[name]) if name in types else text
-            for name, text in texts.items()
-        }
-        return SetJob(session, values, None)
+    component, job = session.component, SetJob(session, settle, force)
     named = [f"{name}: {text!r} is not a number" for name, text in texts.items() if not _is_number(text)]
-    described = await known_of_session(session, choice, needed_for=named[0] if named else "")
-    return SetJob(session, _values(texts, described), described)
-
-
-def _values(texts: Mapping[str, str], described: Metadata | None) -> dict[str, Value]:
-    """Return the values of texts, which are numbers or names in the metadata.
-
-    Raises:
-        UsageError: a text is neither.
-    """
-    values: dict[str, Value] = {}
-    for name, text in texts.items():
-        info = info_of(described, name)
-        if info is None and not _is_number(text):
+    if not component.is_extended:
+        job.described = await known_of_session(session, choice, needed_for=named[0] if named else "")
+    for given, text in texts.items():
+        name = spelling(given, component)
+        if component.is_extended:
+            kind = await _type_of(session, name)
+            job.writes[name] = text if kind is None else parse_ext_value(name, text, kind)
+            continue
+        if (info := info_of(job.described, name)) is None and not _is_number(text):
             raise UsageError(f"{name}: {text!r} is not a number, and no metadata describes {name}")
-        values[name] = (info or ParamInfo(name)).parse(text)
-    return values
+        job.writes[name] = value = (info or ParamInfo(name)).parse(text)
+        if info is not None and (problem := info.problem(value)) is not None:
+            job.doubts.append(problem)
+        if isinstance(value, float) and math.isfinite(value) and not value.is_integer():
+            kind = await _type_of(session, name)
+            if kind is not None and kind.is_integer:
+                what = f"{format_value(value)} is not a whole number, and {name} is an integer"
+                job.doubts.append(f"{name}: {what}")
+    return job
+
+
+async def _type_of(session: CommandSession, name: str) -> ParamType | None:
+    """Return the type of a parameter; None if the vehicle has none of this name, which the write reports."""
+    component = session.component
+    with suppress(UnknownParameter):
+        known = component.params.get(name) or await component.get(name, timeout=session.deadline.left())
+        return known.type
+    return None
 
 
 def _is_number(text: str) -> bool:
@@ -157,93 +150,131 @@ def _is_number(text: str) -> bool:
     return True  # beyond the range of a float
 
 
-async def _doubts(job: SetJob) -> list[str]:
-    """Return sentences on values outside the range, and on fractions for integers."""
-    doubts: list[str] = []
-    component = job.session.component
-    for name, value in job.writes.items():
-        info = info_of(job.described, name)
-        if info is not None and (problem := info.problem(value)) is not None:
-            doubts.append(problem)
-        if isinstance(value, float) and math.isfinite(value) and not value.is_integer():
-            with suppress(ParamClientError):  # the write fails for the same reason, and says so
-                timeout = job.session.deadline.left()
-                known = component.params.get(name) or await component.get(name, timeout=timeout)
-                if known.type.is_integer:
-                    doubts.append(
-                        f"{name}: {format_value(value)} is not a whole number, and {name} is an integer"
-                    )
-    return doubts
+# Writes
 
 
-# reset
+class WriteJob(Shown, Protocol):
+    """What is written to one vehicle; `report` and the rows give the outcomes so far."""
+
+    async def write(self) -> Self:
+        """Write the values, and return the job."""
 
 
-async def reset(
-    url: str,
-    /,
-    *names: str,
-    all_: Annotated[bool, Parameter(name="--all")] = False,
-    changed: bool = False,
-    metadata: MetadataChoice = None,
-    options: ApplyFlags = _APPLY,
-) -> int:
-    """Set parameters to the firmware's defaults, in dependency order, and verify each of them.
+async def write_all(found: Sessions, jobs: Mapping[CommandSession, WriteJob]) -> int:
+    """Write to all vehicles; print the outcomes, also those so far after an interruption.
 
-    Fetches the table first. ArduPilot, and PX4 from 1.18 on, give the defaults in the parameter file over
-    MAVFTP; defaults that the vehicle does not give are taken from its metadata. The state before is stored,
-    for `restore`. On a terminal, the changes are shown and must be confirmed. If several vehicles are heard,
-    --vehicle must choose one, or all. The exit codes are those of apply; 1 also if a default is not known.
+    Returns:
+        The exit code.
 
-    Args:
-        url: The link.
-        names: The parameters, in upper or lower case, or patterns such as "MC_*".
-        all_: Reset all parameters, except those that apply leaves out: identity, calibration, counters and so
-            on, see --include.
-        changed: The same, without a complaint about single parameters whose default is not known.
-        metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
+    Raises:
+        ParamClientError: nothing was written to the only vehicle.
     """
-    from paramclient.cli.apply import State, run  # only here: loads provision
-
-    if bool(names) + all_ + changed != 1:
-        raise UsageError("reset takes names, or --all, or --changed")
-    chosen = check_given(names)
-
-    async def load(session: CommandSession) -> State:
-        missing = (await session.fetch()).missing
-        params, errors = await get_chosen(session, chosen or ["*"], is_fetched=True)
-        for error in errors.values():
-            raise error
-        known = await _known(session, metadata, params)
-        found = {param.name: default_in(known, param) for param in params}
-        wanted = {name: default.value for name, default in found.items() if default is not None}
-        if not wanted:
-            raise VehicleError(no_defaults(), *session.component.address)
-        say_sources(session.label, found.values())
-        problems = []
-        if missing and any(map(is_pattern, chosen or "*")):
-            problems.append(f"incomplete: {counted(len(missing), 'parameter')} not received")
-        if (without := [name for name in found if name not in wanted]) and not changed:
-            listed = first_of(without, LINE_NAMES_MAX)
-            problems.append(f"not written, as their default is not known: {listed}")
-        for problem in problems:
-            report(f"{session.prefix}{problem}")
-        return State(ParamSet(wanted, source="the firmware's defaults"), is_part=bool(problems))
-
-    flags = replace(options, include=(*options.include, *(name.upper() for name in chosen)))
-    return await run(url, flags, load, metadata=metadata)
-
-
-async def _known(session: CommandSession, choice: MetadataChoice, params: Sequence[Param]) -> Metadata | None:
-    """Return the metadata of the vehicle, or None if there is none.
-
-    Without a choice of the user, it is downloaded only if the vehicle does not give a default.
-    """
-    found = await known_of_session(session, choice)
-    if found is not None or all(param.default is not None for param in params):
-        return found
     try:
-        return await request_from_vehicle(session)
-    except (UsageError, VehicleError, NoReply) as error:
-        say(f"{session.label} gives no metadata with defaults: {error}")
-        return None
+        return found.show(await found.work(lambda session: jobs[session].write()))
+    except anyio.get_cancelled_exc_class():
+        found.show(jobs)
+        say("interrupted: the values without a proof may be in flight; run it again to continue")
+        raise
+
+
+@dataclass(eq=False)
+class SetJob:
+    """The values of set for one vehicle in the order of the writes, and the outcomes so far.
+
+    Attributes:
+        session: the vehicle.
+        settle, force: as in `Component.set_many`.
+        described: the metadata of the vehicle, or None.
+        writes: the values by name.
+        doubts: sentences on values outside the range, and on fractions for integers.
+        arrived: the outcomes so far, by name.
+    """
+
+    columns: ClassVar[Sequence[str]] = ("name", "requested", "actual", "status")
+
+    session: CommandSession
+    settle: float
+    force: bool
+    described: Metadata | None = None
+    writes: dict[str, Value] = field(default_factory=dict)
+    doubts: list[str] = field(default_factory=list)
+    arrived: dict[str, SetOutcome] = field(default_factory=dict)
+
+    async def write(self) -> Self:
+        """Write the values; afterwards each has an outcome in any case.
+
+        Raises:
+            AmbiguousVehicle, NoReply, LinkError: as from `CommandSession.check_only`; nothing was written.
+        """
+        session, is_announced = self.session, False
+        await session.check_only()
+
+        def update(outcome: SetOutcome) -> None:
+            nonlocal is_announced
+            is_wrong = isinstance(outcome.error, UnknownParameter | UsageError)
+            if not (is_announced or is_wrong or outcome.status is SetStatus.NOT_TRIED):
+                is_announced = True
+                session.announce_write()
+            self.arrived[outcome.name] = outcome
+            status.count(len(self.arrived), len(self.writes))
+
+        label, timeout = session.label, session.deadline.left()
+        with Status(f"waiting for {label} to acknowledge PARAM_SET", f"setting {label}") as status:
+            try:
+                done = await session.component.set_many(
+                    self.writes, progress=update, timeout=timeout, settle=self.settle, force=self.force
+                )
+                outcomes = done.outcomes
+            except ParamClientError as error:  # raised only if nothing was written
+                pairs = self.writes.items()
+                outcomes = tuple(SetOutcome(*pair, SetStatus.NOT_TRIED, error=error) for pair in pairs)
+        self.arrived = {each.name: each for each in outcomes}
+        return self
+
+    @property
+    def outcomes(self) -> list[SetOutcome]:
+        """One outcome for each value; *unknown* for those without one, after an interruption."""
+        missing = {pair[0]: SetOutcome(*pair, SetStatus.UNKNOWN) for pair in self.writes.items()}
+        return [*(missing | self.arrived).values()]
+
+    def as_json(self) -> JsonObject:
+        """Return the JSON of the vehicle and the outcomes."""
+        results = []
+        for each in self.outcomes:
+            known = self.session.component.params.get(each.name) if each.result is None else each.result.param
+            kind = ParamType.REAL32 if known is None else known.type
+            results.append(outcome_json(each, kind, info_of(self.described, each.name)))
+        return {"vehicle": vehicle_json(self.session.component), "results": results}
+
+    def rows(self) -> Iterator[Sequence[object]]:
+        """Yield the rows; the reported value with its meaning, if that is known."""
+        for each in self.as_json()["results"]:
+            actual = each["actual"] if "text" not in each else f"{each['actual']} ({each['text']})"
+            yield each["name"], each["requested"], actual, Coloured(each["status"], STYLES[each["status"]])
+
+    def report(self) -> int:
+        """Print counts, remarks, and errors: one for all values without a response, and for one cause."""
+        prefix, counts = self.session.prefix, Counter(each.status for each in self.outcomes)
+        if not self.session.options.json:
+            done = counts.pop(SetStatus.ACCEPTED, 0) + counts.pop(SetStatus.ADJUSTED, 0)
+            others = [f"{counts[status]} {status}" for status in SetStatus if status in counts]
+            say(f"{', '.join([f'{done} of {len(self.writes)} set', *others])} on {self.session.receiver}")
+        late, errors = list[str](), dict[str, str]()
+        for each in self.arrived.values():
+            info = info_of(self.described, each.name)
+            if each.is_set and info is not None and info.reboot_required:
+                late.append(each.name)
+            if each.result is not None and each.result.note:
+                say(f"{prefix}{each.name}: {each.result.note}")
+            if each.error is not None:
+                text = str(each.error)
+                if each.status in (SetStatus.UNKNOWN, SetStatus.NOT_TRIED):
+                    errors.setdefault(each.status, text)
+                else:
+                    errors[each.name] = text if each.name in text else f"{each.name}: {text}"
+        if late:
+            say(f"{prefix}takes effect after a reboot: {first_of(late, LINE_NAMES_MAX)}")
+        for text in errors.values():
+            report(f"{prefix}{text}")
+        codes = [code_of(each.error) for each in self.arrived.values() if each.error is not None]
+        return max(codes, default=0)

@@ -81,7 +81,7 @@ def test_nothing_is_sent_with_a_wrong_name(command: Command, put: Put, words: li
     assert (done.code, done.out) == (2, "")
     assert said in done.err
     assert done.err.count("\n") == 1
-    assert not vehicle.requests
+    assert not vehicle.requests["PARAM_SET"]
 
 
 # get

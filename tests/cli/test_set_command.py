@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+import time
 from typing import Any
 
 import pytest
@@ -43,15 +44,13 @@ def statuses(outcome: Outcome) -> dict[str, str]:
 def test_many_pairs_are_in_flight_at_a_time(command: Command, put: Put, kind: Any) -> None:
     """One after the other, 60 writes would take 12 s on this link."""
     vehicle = kind(table=TABLE)
+    began = time.time()
     done = command("set", put(Air.symmetric([vehicle], delay=0.1)), *PAIRS)
+    assert time.time() - began < 6.0, "in simulated time"
     assert done.code == 0
     assert set(vehicle.values.values()) == {7}
     receiver = rf"1/1 {'PX4' if kind is PX4Vehicle else 'ArduPilot'} quadrotor, firmware [\d.]+\S*"
-    found = re.match(
-        rf"writing to {receiver} on sim:custom\n60 of 60 set on {receiver} in (\d+\.\d+) s, ", done.err
-    )
-    assert found
-    assert float(found[1]) < 3.0
+    assert re.match(rf"writing to {receiver} on sim:custom\n60 of 60 set on {receiver}\n", done.err)
     assert [row[0] for row in done.rows[1:]] == NAMES
 
 
@@ -86,7 +85,8 @@ def test_ctrl_c_prints_the_outcomes_so_far(command: Command, put: Put, as_json: 
     vehicle = Interrupting(TABLE)
     done = command("set", put(Air.symmetric([vehicle], delay=0.02)), *PAIRS, *(["--json"] if as_json else []))
     assert done.code == 130
-    assert re.search(r"interrupted: \d+ values not proven", done.err)
+    assert "interrupted: " in done.err
+    assert as_json or re.search(r"^\d+ of 60 set, \d+ unknown on 1/1 ", done.err, re.MULTILINE)
     found = statuses(done) if as_json else {row[0]: row[-1] for row in done.rows[1:]}
     assert [*found] == NAMES
     accepted = [name for name in NAMES if found[name] == "accepted"]
