@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from typing import Final
@@ -12,14 +11,7 @@ import anyio
 
 from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import Seconds, TrafficOptions
-from paramclient.cli.output import (
-    clear_screen,
-    milliseconds,
-    print_json,
-    print_line,
-    print_table,
-    show,
-)
+from paramclient.cli.output import clear_screen, milliseconds, print_json, print_line, print_table, show
 from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
@@ -27,8 +19,10 @@ from paramclient.client.taps import ComponentTraffic, TrafficReport
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.links import list_ports
 from paramclient.model.identity import autopilot_name
+from paramclient.model.names import first_of
 from paramclient.model.notation import rounded
 from paramclient.protocol.channel import task_group
+from paramclient.protocol.identity import kind_in_words
 from paramclient.wire.frames import enum_word, message_name
 
 LINK_LISTENING_TIME: Final = 5.0
@@ -64,19 +58,16 @@ async def link(
         listen_only: Send nothing. The round trip is then not measured.
     """
     is_live = sys.stdout.isatty() and not options.json
-    limit = seconds if is_live or seconds is not None else LINK_LISTENING_TIME
+    deadline = Deadline(seconds, None if is_live else LINK_LISTENING_TIME)
     async with listen(url, options, listen_only=listen_only) as client, task_group() as tasks:
         tasks.start_soon(_measure_round_trips, client)
-        deadline = Deadline(limit)
-        while True:
+        while left := deadline.left(REFRESH_INTERVAL):
+            await anyio.sleep(left)
             report = client.traffic_report()  # raises if the link has failed
             found = _json(client, report)
             if is_live:
                 clear_screen()
                 _print(found)
-            if not (left := deadline.left(REFRESH_INTERVAL)):
-                break
-            await anyio.sleep(left)
         tasks.cancel_scope.cancel()
         if not found["frames"]:
             what, hint = f"a MAVLink frame on {client.link.name}", received_in_words(client)
@@ -102,21 +93,15 @@ async def _measure_round_trips(client: ParamClient) -> None:
             await anyio.sleep(MEASURE_INTERVAL)
 
 
-# JSON
-
-
 def _json(client: ParamClient, report: TrafficReport) -> JsonObject:
     signing = client.signing_report()
     names = ("fingerprint", "policy", "link_id", "signed", "unsigned", "unproven", "refused")
     return {
         "link": client.link.name,
         "seconds": round(report.seconds, 3),
-        "bytes_received": report.totals["received"],
-        "bytes_sent": report.totals["sent"],
-        "received_per_s": round(report.recent["received"], 1),
-        "sent_per_s": round(report.recent["sent"], 1),
-        "frames": report.totals["frames"],
-        "unknown": report.totals["unknown"],
+        **{f"bytes_{name}": report.totals[name] for name in ("received", "sent")},
+        **{f"{name}_per_s": round(report.recent[name], 1) for name in ("received", "sent")},
+        **{name: report.totals[name] for name in ("frames", "unknown")},
         **taken(report, "damaged", "other_bytes"),
         "signing": None if signing is None else taken(signing, *names),
         "components": [_component_json(client, report.at, each) for each in report.components],
@@ -128,86 +113,63 @@ def _component_json(client: ParamClient, now: float, each: ComponentTraffic) -> 
     return {
         **taken(each, "system", "component"),
         "mavlink": each.version,
-        "autopilot": None if beat is None else autopilot_name(beat.autopilot),
-        "type": None if beat is None else enum_word("MAV_TYPE", beat.type),
-        "state": None if beat is None else enum_word("MAV_STATE", beat.system_status),
+        "autopilot": beat and autopilot_name(beat.autopilot),
+        "kind": beat and kind_in_words(beat.autopilot, beat.type),
+        "state": beat and enum_word("MAV_STATE", beat.system_status),
         "heartbeat_age_s": None if each.heartbeat_at is None else rounded(now - each.heartbeat_at),
-        "age_s": round(now - each.received_at, 4),
+        "age_s": rounded(now - each.received_at),
         **{name: each.totals[name] for name in ("frames", "bytes", "lost", "repeated", "late", "signed")},
-        "frames_per_s": round(each.recent["frames"], 2),
-        "bytes_per_s": round(each.recent["bytes"], 1),
+        **{f"{name}_per_s": round(each.recent[name], 2) for name in ("frames", "bytes")},
         "loss": rounded(each.loss),
-        "round_trip_s": None if component is None else rounded(component.round_trip),
+        "round_trip_s": component and rounded(component.round_trip),
         "messages": {
-            message_name(message): {
-                "id": message,
-                "count": each.totals[message],
-                "per_s": round(each.recent[message], 2),
+            message_name(each_id): {
+                "id": each_id,
+                "count": each.totals[each_id],
+                "per_s": round(each.recent[each_id], 2),
             }
-            for message in each.messages
+            for each_id in each.messages
         },
         "radio": each.radio,
     }
 
 
-# Tables
-
-_COLUMNS: Final = ("from", "what", "v", "frames/s", "bytes/s", "loss", "round trip", "heartbeat")
-"""Columns of the table of components."""
-
-
 def _print(found: JsonObject) -> None:
-    print_table(_COLUMNS, map(_row, found["components"]))
-    for line in _lines(found):
-        print_line(line)
-
-
-def _row(each: JsonObject) -> tuple[object, ...]:
-    names = [each["autopilot"], each["type"]] if each["autopilot"] != "no autopilot" else [each["type"]]
-    trip, age = each["round_trip_s"], each["heartbeat_age_s"]
-    return (
-        f"{each['system']}/{each['component']}",
-        " ".join(dict.fromkeys(filter(None, names))) or ("radio" if each["radio"] else ""),
-        each["mavlink"],
-        f"{each['frames_per_s']:.1f}",
-        f"{each['bytes_per_s']:,.0f}",
-        None if each["loss"] is None else f"{each['loss']:.1%}",
-        None if trip is None else milliseconds(trip),
-        None if age is None else f"{age:.1f} s",
-    )
-
-
-def _lines(found: JsonObject) -> Iterator[str]:
-    yield ""
+    rows, lines = [], [""]
     for each in found["components"]:
-        rates = {name: count["per_s"] for name, count in each["messages"].items() if count["per_s"]}
-        shown = [f"{name} {rate:.1f}/s" for name, rate in [*rates.items()][:MESSAGES_SHOWN_MAX]]
-        more = f" and {len(rates) - len(shown)} more" if len(rates) > len(shown) else ""
-        state = f" {each['state']}" if each["state"] else ""
-        yield f"{each['system']}/{each['component']}{state}: {', '.join(shown) or 'silent'}{more}"
-        if radio := each["radio"]:
-            yield (
-                f"  signal {radio['rssi']} here, {radio['remote_rssi']} there; noise {radio['noise']} and "
-                f"{radio['remote_noise']}; buffer {radio['free']} % free; {radio['errors']} packets with "
-                f"errors, {radio['fixed']} corrected"
+        address, radio = f"{each['system']}/{each['component']}", each["radio"]
+        trip, age, loss = each["round_trip_s"], each["heartbeat_age_s"], each["loss"]
+        rows.append(
+            (
+                address,
+                each["kind"] or ("radio" if radio else ""),
+                each["mavlink"],
+                f"{each['frames_per_s']:.1f}",
+                f"{each['bytes_per_s']:,.0f}",
+                None if loss is None else f"{loss:.1%}",
+                None if trip is None else milliseconds(trip),
+                None if age is None else f"{age:.1f} s",
             )
-    yield ""
-    yield (
-        f"{found['link']}, {found['seconds']:.1f} s: {found['received_per_s']:,.0f} bytes/s received, "
-        f"{found['sent_per_s']:,.0f} sent"
-    )
+        )
+        kinds = [f"{name} {one['per_s']:.1f}/s" for name, one in each["messages"].items() if one["per_s"]]
+        state = f" {each['state']}" if each["state"] else ""
+        lines.append(f"{address}{state}: {first_of(kinds, MESSAGES_SHOWN_MAX) or 'silent'}")
+        lines += [f"  {', '.join(f'{name} {value}' for name, value in radio.items())}"] if radio else []
     lost, signed = (sum(each[name] for each in found["components"]) for name in ("lost", "signed"))
-    yield (
-        f"{found['frames']:,} frames, {lost:,} lost, {found['damaged']:,} with a wrong checksum, "
-        f"{found['unknown']:,} of unknown ids, {signed:,} signed; {found['other_bytes']:,} other bytes"
+    rates = f"{found['received_per_s']:,.0f} bytes/s received, {found['sent_per_s']:,.0f} sent"
+    faults = f"{found['damaged']:,} with a wrong checksum, {found['unknown']:,} of unknown ids"
+    lines += ["", f"{found['link']}, {found['seconds']:.1f} s: {rates}"]
+    lines.append(
+        f"{found['frames']:,} frames, {lost:,} lost, {faults}, {signed:,} signed; "
+        f"{found['other_bytes']:,} other bytes"
     )
     if signing := found["signing"]:
-        others = [
-            f", {count:,} {what}: {reason}"
-            for name, what in (("unproven", "accepted"), ("refused", "refused"))
-            for reason, count in signing[name].items()
-        ]
-        yield f"key {signing['fingerprint']}: {signing['signed']:,} frames proven{''.join(others)}"
+        accepted = [f", {count:,} accepted: {reason}" for reason, count in signing["unproven"].items()]
+        refused = [f", {count:,} refused: {reason}" for reason, count in signing["refused"].items()]
+        proven = f"key {signing['fingerprint']}: {signing['signed']:,} frames proven"
+        lines.append("".join([proven, *accepted, *refused]))
+    print_table(("from", "what", "v", "frames/s", "bytes/s", "loss", "round trip", "heartbeat"), rows)
+    print_line("\n".join(lines))
 
 
 # ports
@@ -221,21 +183,10 @@ def ports(*, json: bool = False) -> None:
     Args:
         json: Print JSON.
     """
-    found = [
-        {
-            **asdict(port),
-            "link": port.link,
-            "autopilot": port.autopilot,
-            "vendor_id": None if port.vendor_id is None else f"{port.vendor_id:04x}",
-            "product_id": None if port.product_id is None else f"{port.product_id:04x}",
-        }
-        for port in list_ports()
-    ]
+    found = [asdict(port) | taken(port, "link", "autopilot") for port in list_ports()]
+    for port in found:
+        for name in ("vendor_id", "product_id"):
+            port[name] = None if port[name] is None else f"{port[name]:04x}"
     columns = ["device", "autopilot", "product", "manufacturer", "vendor_id", "product_id", "link"]
-    show(
-        {"ports": found},
-        columns,
-        ([port[name] for name in columns] for port in found),
-        json=json,
-        empty="this computer has no serial ports",
-    )
+    rows = ([port[name] for name in columns] for port in found)
+    show({"ports": found}, columns, rows, json=json, empty="this computer has no serial ports")

@@ -331,11 +331,11 @@ def test_link_prints_a_table_of_components(command: Command, put: Put) -> None:
     received = command("link", put(Modem(telemetry=20)), "--seconds", 2)
     assert (received.code, received.err) == (0, "")
     lines = received.out.splitlines()
-    assert re.fullmatch(r"1/1 +px4 quadrotor +2 +[0-9.]+ +[0-9,]+ +0\.0% +[0-9.]+ ms +[0-9.]+ s", lines[1])
+    assert re.fullmatch(r"1/1 +PX4 quadrotor +2 +[0-9.]+ +[0-9,]+ +0\.0% +[0-9.]+ ms +[0-9.]+ s", lines[1])
     assert re.match(r"51/68 +radio +2 +[0-9.]+ ", lines[2])
     assert re.match(r"1/1 standby: ATTITUDE [0-9.]+/s, HEARTBEAT [0-9.]+/s, ", lines[4])
     assert re.match(r"51/68: RADIO_STATUS [0-9.]+/s, UNKNOWN_8388607 [0-9.]+/s$", lines[5])
-    assert lines[6].startswith("  signal 200 here, 190 there; noise 40 and 42; buffer 96 % free; ")
+    assert lines[6].startswith("  errors 3, fixed 2, rssi 200, remote_rssi 190, free 96, noise 40, ")
     assert re.search(
         r"[0-9,]+ frames, 0 lost, 0 with a wrong checksum, [1-9][0-9]* of unknown ids", lines[-1]
     )
@@ -356,7 +356,7 @@ def test_link_is_live_on_a_terminal() -> None:
     assert shown.code == 0
     assert shown.out.count("round trip") >= 3
     *_, last = shown.out.split("heartbeat")
-    assert "px4 quadrotor" in last  # the last table stays
+    assert "PX4 quadrotor" in last  # the last table stays
     assert "1/1 standby: " in last
 
 
