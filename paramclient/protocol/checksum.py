@@ -37,6 +37,8 @@ AT_ONCE: Final = 4
 """Requests sent at once: of five, a Plane and a Rover lose the next one within 10 ms (measured)."""
 INTERVAL_FIRST: Final = 0.012
 """Seconds from these to the next request."""
+OUTDATED: Final = 0.1
+"""Seconds after which a checksum is requested again with the next ones: a pressure changes every second."""
 INTERVAL: Final = 0.006
 """Seconds between further requests: ArduPilot loses some of those sent every 4 ms (measured)."""
 REQUEST_SIZE: Final = 54
@@ -132,6 +134,7 @@ class _Proof:
         self._content = b"".join(entries)  # behind the header
         self._ends = list(accumulate(map(len, entries)))  # of the first rows, by their number
         self._found: dict[int, int] = {}  # the vehicle's checksum of the first rows, by their number
+        self._asked_at: dict[int, float] = {}  # when it was first requested
         self._changed: dict[int, float] = {}  # by index, when the value was known
         self._refuted: set[tuple[int, int]] = set()  # wrong guesses
         self._round_trip = math.inf  # of the quickest requests
@@ -171,8 +174,6 @@ class _Proof:
                     guesses |= guess
                 elif ends := self._ends_of(always | often | seconds | rare, place):
                     numbers |= ends | (self._divide(place) if self._is_slow else set())
-                elif place.stop == next(iter(self._found)) == len(whole) > len(place):
-                    numbers.add(len(whole))  # it was the first one, and values may have moved since
                 elif len(place) > 1:
                     numbers |= self._divide(place)
                     divided.append(place)
@@ -182,7 +183,8 @@ class _Proof:
                     return False
             self._weigh(len(guesses), len(numbers), divided)
             if numbers:
-                await self._request(numbers)
+                numbers |= self._forget_outdated(places)
+                await self._request(numbers | self._ends_of(always, whole))
             elif guesses:
                 await self._read(guesses)
                 suspects -= guesses.keys()
@@ -199,6 +201,15 @@ class _Proof:
         """Return the numbers of rows whose checksums show these values, as far as they are in a range and not
         known."""
         return {end for at in indices if at in place for end in (at, at + 1)} - {0, *self._found}
+
+    def _forget_outdated(self, places: Collection[range]) -> set[int]:
+        """Forget checksums that may be of other values than the next ones, and return those still needed."""
+        needed = {len(self._rows)}.union(*((place.start, place.stop) for place in places))
+        since = anyio.current_time() - OUTDATED
+        outdated = {number for number in self._found if self._asked_at[number] < since}
+        for number in outdated:
+            del self._found[number]
+        return outdated & needed
 
     @property
     def _parts(self) -> int:
@@ -288,10 +299,10 @@ class _Proof:
         attempts = None if is_proven else attempts_unproven(session.channel)
 
         async def request(number: int) -> None:
+            self._asked_at[number] = anyio.current_time()
             query = "" if number == len(self._rows) else f"?count={number}"
             answer = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
-            self._found.pop(number, None)
-            self._found[number] = answer  # the last one
+            self._found[number] = answer
 
         async with task_group() as tasks:
             for place, number in enumerate(sorted(numbers, reverse=True)):

@@ -259,11 +259,12 @@ class Table:
             name, from_bits(entry.bits, entry.type), entry.type, index, entry.bits, Trust.LIVE, default
         )
         raw = as_reported(entry.bits, entry.type, self._encoding)
-        is_newer = old is not None and self.moments[name] > now and old.trust is Trust.LIVE
+        moment = max(now, self.moments.get(name, now))
+        is_newer = old is not None and moment > now and old.trust is Trust.LIVE
         if old is not None and is_newer and not self._is_reported(old, raw, entry.type):
             self.params[name] = replace(old, index=index, default=default)
             return
-        self.moments[name] = now
+        self.moments[name] = moment
         if self._held is not None:
             self._wire[name] = (raw, entry.type)
         self._put(name, old, new)

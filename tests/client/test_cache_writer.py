@@ -30,6 +30,7 @@ from paramclient.wire import frames, messages
 from tests.caches import changes as history_of
 from tests.caches import read_only
 from tests.client.conftest import connected, fetched, table_in
+from tests.conversations.virtual import Tap as Filter
 from tests.shell import (
     VALUES,
     Radio,
@@ -369,6 +370,19 @@ async def test_a_change_by_another_station_is_in_the_history_with_its_address(pa
 
 
 # With it, and without
+
+
+async def test_a_value_announced_just_before_the_file_was_read_keeps_its_index(path: Path) -> None:
+    vehicle = ArduPilotVehicle(live_period=0.0)
+
+    def passes(message: messages.Message) -> bool:
+        if isinstance(message, messages.FileTransfer):
+            vehicle.set_param("RTL_ALT", 4321)
+        return True
+
+    first = await session(Air.symmetric([Filter(vehicle, up=passes)], delay=0.05), path)
+    second = await session(vehicle, path)
+    assert (first.source, second.source, second.params["RTL_ALT"].value) == ("ftp", "cache", 4321)
 
 
 async def test_a_cache_that_was_given_stays_open(path: Path) -> None:

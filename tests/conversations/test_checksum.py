@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Callable
 from dataclasses import replace
@@ -129,6 +130,27 @@ async def test_a_value_that_moves_between_two_requests_starts_no_search() -> Non
         assert result.source == "cache"
         check(vehicle, node, result)
         assert len(opcodes(conversation)) <= 6
+
+
+@pytest.mark.parametrize("after", [0, 1, 2])
+@virtual
+async def test_pressure_that_moves_between_two_requests_costs_one_round_trip(after: int) -> None:
+    vehicle = ArduPilotVehicle(kind="rover", live_period=0.0)
+    pressures = ("BARO1_GND_PRESS", "BARO2_GND_PRESS")
+    answers = itertools.count()
+
+    def passes(message: Message) -> bool:
+        if isinstance(message, FileTransfer) and next(answers) == after:
+            vehicle.load({name: float(vehicle.param(name).value) + 0.5 for name in pressures})
+        return True
+
+    async with converse(Air.symmetric([Tap(vehicle, down=passes)], delay=0.05)) as conversation:
+        node = await with_cached_table(conversation, vehicle.params)
+        began = anyio.current_time()
+        result = await fetch_all(node.plain)
+        assert (result.source, result.changed) == ("cache", ())
+        check(vehicle, node, result)
+        assert anyio.current_time() - began < 0.35
 
 
 @virtual
