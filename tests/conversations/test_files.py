@@ -292,3 +292,16 @@ async def test_a_burst_over_a_slow_link_is_requested_once(rate: float) -> None:
         sent = [each.opcode for each in packets_in(conversation.sent_of(FileTransfer))]
         assert sent.count(Opcode.BURST_READ_FILE) <= 2
         assert result.elapsed < 30_000 / rate
+
+
+async def test_a_burst_whose_first_blocks_are_lost_is_requested_once() -> None:
+    """Another one would send the whole file again, which takes seconds over a radio."""
+
+    def is_block(message: Message) -> bool:
+        return any(each.requested == Opcode.BURST_READ_FILE for each in packets_in([message]))
+
+    vehicle = Tap(ArduPilotVehicle(ftp_rate=1_920.0), down=losing(2, is_block))
+    async with talking(vehicle) as (conversation, session):
+        assert (await fetch_all(session)).source == "ftp"
+        sent = [each.opcode for each in packets_in(conversation.sent_of(FileTransfer))]
+        assert sent.count(Opcode.BURST_READ_FILE) == 1
