@@ -38,7 +38,7 @@ class PlanOptions(TypedDict, total=False):
     Attributes:
         include: categories (`CATEGORIES`) and globs of names to set although the list leaves them out.
         info: metadata by name.
-        force: allow NaN and infinity for every autopilot.
+        force: allow values outside of the range in the metadata, and NaN and infinity for every autopilot.
     """
 
     include: str | Iterable[str]
@@ -258,8 +258,9 @@ def plan_from(
     A value is invalid if the parameter's type cannot hold it, or if it cannot be sent exactly: a fraction for
     an integer, and, where integers are sent as float32 (ArduPilot), an integer beyond 24 bits. Values outside
     of the range in the metadata, and values that are not finite, are invalid unless "out-of-range" is
-    included: many vehicles accept such values without an error. For PX4 and ArduPilot, only `force` allows
-    NaN and infinity: PX4 cannot save them, nor any other parameter from then on, and may stop.
+    included, or `force` is given: many vehicles accept such values without an error. For PX4 and ArduPilot,
+    only `force` allows NaN and infinity: PX4 cannot save them, nor any other parameter from then on, and may
+    stop.
 
     Args:
         current: the vehicle's parameters: a table, such as `component.params`, or a snapshot.
@@ -346,7 +347,8 @@ class _Planner:
         """Return whether the range of a value to write was to be checked, and is not known."""
         name, value = row.name, row.wanted.settable
         is_to_check = row.status is ApplyStatus.SET and not isinstance(value, str | bytes)
-        return is_to_check and name not in self.described and not self.choice.has(name, OUT_OF_RANGE)
+        is_to_check = is_to_check and not (self.force or self.choice.has(name, OUT_OF_RANGE))
+        return is_to_check and name not in self.described
 
     def row(self, wanted: WrittenParam) -> ApplyRow:
         """Return the row of one parameter; `settle_missing` completes rows of missing parameters."""
@@ -461,11 +463,9 @@ class _Planner:
                 return WRONG, f"{value!r} is not a whole number, and the parameter is {ParamType(kind).name}"
         if target.is_raw and not isinstance(before, bytes):
             return WRONG, f"{format_value(value)} are raw bytes, and the vehicle has a number"
-        if isinstance(value, bytes | str):
+        if self.force or isinstance(value, bytes | str):
             return None
         if not math.isfinite(value):
-            if self.force:
-                return None
             # only ArduPilot sends integers as float32
             usual = "ardupilot" if self.encoding is Encoding.C_CAST else ""
             reason = reason_against_non_finite(self.autopilot or usual)

@@ -168,7 +168,7 @@ class PlanOptions(Body):
     """What else is written; `include` takes names, patterns and categories, such as out-of-range."""
 
     include: Patterns = ()
-    force: Annotated[bool, Field(description="Write NaN and infinities.")] = False
+    force: Annotated[bool, Field(description="Write values out of range, NaN and infinities.")] = False
 
 
 class PlanRequest(PlanOptions):

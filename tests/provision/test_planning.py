@@ -196,6 +196,7 @@ def test_a_value_outside_of_the_metadata_range_is_invalid() -> None:
         status, category, reason = only_row(plan_from(table, written(P=value), info=info))
         assert (status, category, says in reason) == (ApplyStatus.INVALID, OUT_OF_RANGE, True)
         assert plan_from(table, written(P=value), info=info, include=OUT_OF_RANGE).to_write
+        assert plan_from(table, written(P=value), info=info, force=True).to_write
         assert plan_from(table, written(P=value)).to_write
     for value in (0.1, 2, 0.10000000149011612):
         assert plan_from(table, written(P=value), info=info).to_write
