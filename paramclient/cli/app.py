@@ -197,11 +197,11 @@ _add(_app, "read_commands:watch", "URL [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_
 _add(_app, "link:link", None, "udpin:0.0.0.0:14550 --seconds 10 --json")
 _add(_app, "check:check", None, "udpin:0.0.0.0:14550")
 _add(_app, "show:show", "[FILE|VEHICLE [NAME...]]", "", "1 MC_ROLL_P", "quad.params")
-_add(_app, "diff:diff", "LEFT RIGHT", "quad.param udpin:0.0.0.0:14550 --only 'MC_*'", "1 2 --base defaults")
+_add(_app, "sources:diff", "LEFT RIGHT", "quad.param tcp:127.0.0.1:5760 --only 'MC_*'", "1 2 --base defaults")
 _add(_app, "cached:history", "VEHICLE [NAME...]", "1 'MC_*' --since '2h ago'", "1 --snapshots")
 _add(_app, "show:search", "WORD [WORD...]", "roll rate", "geofence --metadata apm.pdef.xml")
 _add(_app, "show:info", None, "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
-_add(_app, "save:save", "URL|LOG|VEHICLE FILE", "udpin:0.0.0.0:14550 quad.params", "1 tuned.param --changed")
+_add(_app, "sources:save", "URL|LOG|VEHICLE FILE", "udpin:0.0.0.0:14550 quad.params", "1 own.param --changed")
 _add(
     _app, "apply:apply", "URL FILE", "sim:px4 quad.params --dry-run", "sim:px4 '{system}.param' --vehicle all"
 )

@@ -1,24 +1,57 @@
-"""Sources of parameters in arguments (see `provision.sources`), sets in words, file names with ids."""
+"""The subcommands save and diff; the parameters that an argument names; file names with ids of vehicles."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Container, Sequence
 from dataclasses import replace
+from functools import partial as bind
 from pathlib import Path, PurePath
-from typing import Final
+from typing import Annotated, Final
 
+import anyio.to_thread
+from cyclopts import Parameter
+
+from paramclient.cli.json_output import JsonObject, diff_json, taken
+from paramclient.cli.metadata import (
+    METADATA_HINT,
+    MetadataFile,
+    defaults_in,
+    known_of_sets,
+    no_defaults,
+    say_sources,
+)
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import local_time, report
+from paramclient.cli.output import (
+    LINE_NAMES_MAX,
+    Coloured,
+    ExitCode,
+    local_time,
+    print_json,
+    print_table,
+    report,
+    say,
+)
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
-from paramclient.errors import UsageError
-from paramclient.files.formats import ENDINGS, address
+from paramclient.errors import UsageError, VehicleError
+from paramclient.files import FileFormat, writable, write_file
+from paramclient.files.formats import ENDINGS, address, format_of_name
 from paramclient.links import FORMS, LinkKind, parse_link
+from paramclient.metadata import Metadata
+from paramclient.model.comparison import ChangedSide, compare
 from paramclient.model.identity import autopilot_name
-from paramclient.model.names import counted
-from paramclient.model.paramset import ParamSet
+from paramclient.model.names import NameChoice, counted, first_of
+from paramclient.model.paramset import ParamSet, default_of
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.sources import fetched_set, is_file, is_offline, link_of, resolve
+from paramclient.provision.sources import (
+    choose,
+    collect_defaults,
+    fetched_set,
+    is_file,
+    is_offline,
+    link_of,
+    read_source,
+    select_non_defaults,
+)
 
 SOURCES: Final = f"""\
   FILE                a parameter file or a log (.bin, .ulg, .tlog) that exists; - for the standard input
@@ -33,6 +66,19 @@ _ENDINGS: Final = frozenset({*ENDINGS, ".bin", ".ulg", ".txt", ".csv"})
 meant as a file, and no link name has one."""
 
 
+DEFAULTS: Final = "defaults"
+"""The value of --base for the firmware's defaults; a file of this name is `./defaults`."""
+MEANING_LENGTH_MAX: Final = 40
+"""Characters of the meaning of a value in a table. A bit mask of ArduPilot may have 30 names, and one such
+row would make the table wider than every screen."""
+_STYLES: Final = {"different": "yellow", "only left": "red", "only right": "green"}
+"""Styles of differences."""
+_DEFAULTS: Final = LinkOptions()
+
+
+# Sources
+
+
 async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: bool = False) -> list[ParamSet]:
     """Return the parameters of each source: files first, then cached vehicles, then links.
 
@@ -45,56 +91,58 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: boo
         writes: whether the values will be written; see `sessions`.
 
     Raises:
-        ParamClientError: as from `resolve`.
+        ParamClientError: as from `sets_of`.
     """
-    choice, extended = ChosenVehicle.parse(options.vehicle), options.extended
-
-    async def fetch(url: str) -> ParamSet:
-        chosen = replace(without_cache(url, options), extended=extended)
-        async with sessions(url, chosen, writes=writes) as opened:
-            table = await whole_table(opened[0])
-            if not writes:
-                opened.report_others()
-            return table
-
-    found: dict[str, ParamSet] = {}
+    if ChosenVehicle.parse(options.vehicle).is_all:  # these are the vehicles to write to
+        options = replace(options, vehicle=None)
     for text in texts:
         check_link(link_of(text))
+    found: dict[str, ParamSet] = {}
     for text in sorted(texts, key=lambda text: (not is_file(text), not is_offline(text))):
         if text not in found:
-            found[text] = await resolve(
-                text,
-                system=choice.system,
-                component=choice.component,
-                extended=extended,
-                cache=options.place,
-                fetch=fetch,
-            )
-            extended = extended or found[text].is_extended
+            (found[text],), _ = await sets_of(text, options, writes=writes)
+            options = replace(options, extended=options.extended or found[text].is_extended)
     return [found[text] for text in texts]
 
 
-def without_cache(url: str, options: LinkOptions) -> LinkOptions:
-    """Return the options for a link: a log uses no cache, and --cache is for other sources and metadata."""
-    is_log = url.startswith(f"{LinkKind.REPLAY}:")
-    return replace(options, cache=None, no_cache=True) if is_log else options
-
-
-async def whole_table(session: CommandSession, *, partial: bool = False) -> ParamSet:
-    """Fetch the table of a session's component; return the values received or confirmed in this session.
+async def sets_of(
+    text: str, options: LinkOptions, *, writes: bool = False, incomplete: bool = False
+) -> tuple[list[ParamSet], bool]:
+    """Return the parameters of a source, and whether those of some vehicle could not be read.
 
     Args:
-        session: the session.
-        partial: whether a set of some parameters is returned; its source names the others.
+        text: a file, a vehicle in the cache, or a link.
+        options: --vehicle selects the vehicle of a link, the component of a file or of the cache, or all.
+        writes: as in `resolve_all`.
+        incomplete: whether some parameters of a table may be missing; the source of the set names them.
 
     Raises:
+        UsageError: the text names none of them, or has no parameters for --vehicle.
         VehicleError: some parameters were not received; the message names them.
-        NoReply, LinkError: as from `Component.fetch_all`.
+        ParamClientError: the cache has no such table; the vehicle did not answer; the link failed.
     """
-    result, link = await session.fetch(), session.client.link.name
-    for note in result.notes:
-        report(f"{session.label} on {link}: {note}")
-    return fetched_set(session.component, result, source=f"link {link}", partial=partial)
+    choice, link = ChosenVehicle.parse(options.vehicle), link_of(text)
+    check_link(link)
+    if is_offline(text):
+        read = bind(read_source, text, component=choice.component, every=choice.is_all, cache=options.place)
+        read = bind(read, extended=options.extended, incomplete=incomplete)
+        file = await anyio.to_thread.run_sync(read)  # a log of 100 MB takes seconds
+        assert file is not None, "it is no link"
+        return [*file.sets] if choice.is_all else [choose(file, choice.component, choice.system)], False
+
+    async def fetch(session: CommandSession) -> ParamSet:
+        result, source = await session.fetch(), f"link {session.client.link.name}"
+        for note in result.notes:
+            report(f"{session.label} on {session.client.link.name}: {note}")
+        return fetched_set(session.component, result, source=source, partial=incomplete)
+
+    if link.startswith(f"{LinkKind.REPLAY}:"):  # --cache is for other sources, and for metadata
+        options = replace(options, cache=None, no_cache=True)
+    async with sessions(link, options, writes=writes) as opened:
+        done = await opened.work(fetch)
+        opened.report_others()
+    opened.report_errors()
+    return [*done.values()], bool(opened.errors)
 
 
 def check_link(text: str) -> None:
@@ -104,34 +152,209 @@ def check_link(text: str) -> None:
         UsageError: it does not; the message lists the accepted sources, unless the text is the name of a
             file that does not exist.
     """
-    if is_offline(text):
-        return
     try:
-        parse_link(text)
+        if not is_offline(text):
+            parse_link(text)
     except UsageError as error:
         if PurePath(text).suffix.lower() in _ENDINGS:
-            raise UsageError(f"no such file: {text}{_nearest_file(text)}") from None
-        problem = str(error).splitlines()[0]
-        raise UsageError(
-            f"no such file, and no cached vehicle; {problem}\naccepted sources:\n{SOURCES}"
-        ) from None
-
-
-def _nearest_file(text: str) -> str:
-    """Return a question about similar names in the folder, or that there is no such folder; or ""."""
-    folder = Path(text).parent
-    if not folder.is_dir():
-        return f"; there is no folder {folder} here"
-    similar = difflib.get_close_matches(Path(text).name, [each.name for each in folder.iterdir()], n=1)
-    return f" (did you mean {folder / similar[0]}?)" if similar else ""
-
-
-# Sets
+            raise UsageError(f"no such file: {text}") from None
+        problem = f"no such file, and no cached vehicle; {str(error).splitlines()[0]}"
+        raise UsageError(f"{problem}\naccepted sources:\n{SOURCES}") from None
 
 
 def part_of(params: ParamSet, names: Container[str]) -> ParamSet:
     """Return a set with only the parameters of these names."""
     return replace(params, params={name: param for name, param in params.items() if name in names})
+
+
+# save
+
+
+async def save(
+    where: str,
+    file: Path,
+    /,
+    *,
+    file_format: Annotated[FileFormat | None, Parameter(name="--format")] = None,
+    changed: bool = False,
+    only: tuple[str, ...] = (),
+    incomplete: bool = False,
+    metadata: MetadataFile = None,
+    options: LinkOptions = _DEFAULTS,
+) -> int:
+    """Write the parameters of a vehicle to a file, in the file format of any ground station.
+
+    An existing file is replaced once the new one is completely on the disk. An incomplete table is written
+    with --incomplete only. Exit code 1: the table is incomplete, or with --changed, no parameter differs or
+    the defaults are not known. With --vehicle all, a file with {system} or {uid} in its name becomes a file
+    for each vehicle; otherwise the file format must be able to hold several components.
+
+    Args:
+        where: The link, such as udpin:0.0.0.0:14550 or sim:px4; an on-board log (.bin, .ulg), for the values
+            at its end, or another parameter file; or a vehicle in the cache: 4 or 4/1, px4 or ardupilot, its
+            hardware id (in full, or uid: and at least 6 digits), or its key.
+        file: The file. Its extension determines the file format: .params, .parm, .param, .pck, .json.
+        file_format: The file format, if the extension does not determine it.
+        changed: Write only parameters that differ from the firmware's defaults: those of the vehicle, else
+            those of its metadata.
+        only: Write only this name or pattern, such as "MC_*". May be given several times.
+        incomplete: Write the parameters that were received where others were not; the file names these.
+        metadata: With --changed, a file with the firmware's defaults. Default: the stored metadata of the
+            firmware.
+    """
+    if metadata is not None and not changed:
+        raise UsageError("--metadata gives the defaults for --changed")
+    written = file_format or format_of_name(str(file))
+    try:
+        sets, is_part = await sets_of(where, options, incomplete=incomplete)
+    except VehicleError as error:  # the table is incomplete
+        hint = f"{error}; --incomplete writes what was received"
+        raise VehicleError(hint, error.system, error.component) from None
+    if changed:
+        known = known_of_sets(sets, options, metadata)
+        differing = [_differing(*each) for each in zip(sets, known, strict=True)]
+        sets, is_part = [each for each in differing if each], is_part or None in differing
+    if only and sets:
+        names = NameChoice(only).choose({name for each in sets for name in each})
+        sets = [part for each in sets if (part := part_of(each, names))]
+    files: dict[str, list[ParamSet]] = {}
+    for each in sets:
+        uid = None if each.identity is None else each.identity.uid
+        kept, left_out = writable(each, written)
+        if left_out:
+            listed = first_of(left_out, LINE_NAMES_MAX)
+            report(f"{address(each)}: left out, as only a .json file can hold them: {listed}")
+        files.setdefault(filled(str(file), each.system, uid, address(each)), []).append(kept)
+    found: list[JsonObject] = []
+    for path, of_file in files.items():
+        await anyio.to_thread.run_sync(bind(write_file, path, of_file, file_format=written))
+        members = [taken(each, "system", "component") | {"params": len(each)} for each in of_file]
+        found.append({"path": path, "format": written.value, "components": members})
+        if not options.json:
+            contents = ", ".join(
+                f"{counted(len(each), noun_of(each))} of {address(each)}" for each in of_file
+            )
+            say(f"{contents} written to {path} ({written})")
+    if not found:
+        report(f"nothing was written to {file}")
+    elif options.json:
+        print_json(found[0] if len(found) == 1 else {"files": found})
+    return ExitCode.DONE if found and not is_part else ExitCode.INCOMPLETE
+
+
+def _differing(whole: ParamSet, metadata: Metadata | None) -> ParamSet | None:
+    """Return the parameters that differ from the defaults; None, and an error line, if none is known to."""
+    described = defaults_in(metadata, whole)
+    try:
+        differing = select_non_defaults(whole, described)
+    except UsageError as error:
+        report(f"{address(whole)}: {no_defaults() if str(error) in no_defaults() else error}")
+        return None
+    say_sources(address(whole), (default_of(each, described.get(each.name)) for each in differing.values()))
+    return differing
+
+
+# diff
+
+
+async def diff(
+    left: str,
+    right: str,
+    /,
+    *,
+    base: str | None = None,
+    only: tuple[str, ...] = (),
+    partial: bool = False,
+    metadata: MetadataFile = None,
+    options: LinkOptions = _DEFAULTS,
+) -> ExitCode:
+    """Compare the parameters of two files, links or vehicles in the cache.
+
+    Exit code 0: both have the same names with the same values. Exit code 1: they differ.
+
+    Args:
+        left: A parameter file; a vehicle in the cache, as 4, px4 or ardupilot, its hardware id (in full, or
+            uid: and at least 6 digits), its key, or cache:VEHICLE; or a link.
+        right: A file, a vehicle in the cache, or a link, like LEFT.
+        base: A third source, or "defaults" for the firmware's defaults, to see which side differs from it.
+        only: Compare only this name or pattern, such as "MC_*". May be given several times.
+        partial: Leave out parameters that only the right side has; if the right side is a file and the left
+            one is not, those that only the left side has.
+        metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
+    """
+    if left == right and not is_offline(left):
+        hint = "`paramclient diff 1 2` compares two vehicles in the cache"
+        raise UsageError(f"both sides are the vehicle on {left}; {hint}")
+    given = [left, right, *([] if base in (None, DEFAULTS) else [base or ""])]
+    first, second, *third = await resolve_all(given, options)
+    if partial and is_file(right) and not is_file(left):
+        first = part_of(first, second)
+    elif partial:
+        second = part_of(second, first)
+    known = known_of_sets([first, second, *third], options, metadata)
+    before = third[0] if third else None
+    if base == DEFAULTS:
+        try:
+            before = collect_defaults([first, second], [*map(defaults_in, known, (first, second))])
+        except UsageError as error:
+            raise UsageError(f"{error}; {METADATA_HINT}") from None
+        known.append(known[0] or known[1])
+    outcome = compare(first, second, base=before, names=only or None)
+    found = diff_json(outcome, [*known, None][:3], has_defaults=base == DEFAULTS)
+    if options.json:
+        print_json(found)
+    else:
+        _print(found)
+        for side, params in (("left", first), ("right", second), ("base", before)):
+            if params is not None:
+                say(f"{side}: {described(params)}")
+        say(_summary(found))
+        if not (partial or outcome.is_same) and is_file(left) != is_file(right):
+            say("--partial leaves out the parameters that the file does not have")
+    return ExitCode.DONE if outcome.is_same else ExitCode.DIFFERENT
+
+
+def _print(found: JsonObject) -> None:
+    """Print the entries that differ."""
+    rows = []
+    for name, entry in found["params"].items():
+        side, words = entry["changed_side"], [entry["is"]]
+        if entry["types_differ"]:
+            words.append(f"{entry['left']['type']} and {entry['right']['type']}")
+        if entry["rounding"]:
+            words.append("the same as float32")
+        style = "bold red" if side == ChangedSide.CONFLICT else _STYLES.get(entry["is"], "")
+        values = [_shown(entry[each]) for each in ("left", "right", "base")]
+        changed = None if found["base"] is None else side or "unknown"
+        rows.append([name, *values, entry.get("units"), Coloured(", ".join(words), style), changed])
+    if rows:
+        print_table(["name", "left", "right", "base", "units", "is", "changed"], rows)
+
+
+def _shown(side: JsonObject | None) -> str | None:
+    """Return a value with its meaning, if known: `5 (Loiter)`. `info` prints all names of a bit mask."""
+    if side is None:
+        return None
+    meaning = side.get("text", "")
+    if len(meaning) > MEANING_LENGTH_MAX:
+        meaning = f"{meaning[:MEANING_LENGTH_MAX]}..."
+    return f"{side['value']} ({meaning})" if meaning else str(side["value"])
+
+
+def _summary(found: JsonObject) -> str:
+    """Return the numbers of entries of each kind."""
+    counts, sides = found["counts"], found["changed_sides"]
+    other = sum(entry["types_differ"] for entry in found["params"].values())
+    words = [f"{number} {kind}" for kind, number in (counts | {"of another type": other}).items() if number]
+    if sides is not None:
+        unknown = sum(counts.values()) - sum(sides.values())
+        changed = [f"{number} {side}" for side, number in sides.items() if number and side != "neither"]
+        words.append(f"changed from the base: {', '.join(changed) or 'none'}")
+        words += [f"{unknown} not in the base"] if unknown else []
+    return "; ".join(words)
+
+
+# Sets in words, and file names for several vehicles
 
 
 def described(params: ParamSet) -> str:
@@ -148,9 +371,6 @@ def described(params: ParamSet) -> str:
 def noun_of(params: ParamSet) -> str:
     """Return the parameters of a set in words, in the singular."""
     return "extended parameter" if params.is_extended else "parameter"
-
-
-# File names for several vehicles
 
 
 def is_pattern_name(name: str) -> bool:

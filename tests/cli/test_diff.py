@@ -160,7 +160,6 @@ def test_only_compares_the_named_parameters(command: Command) -> None:
         (["1", "1", "--vehicle", "1/9"], "which has 1/1 (uid:aa00000000000001)"),
         (["quad", "1"], "no such file, and no cached vehicle; link name 'quad': the kind of link is missing"),
         (["quad.params", "1"], "paramclient: no such file: quad.params\n"),
-        (["nowhere/quad.param", "1"], "quad.param; there is no folder nowhere here\n"),
         (["1", "2", "--base", "quad"], "  cache:VEHICLE "),
         (["udpin:x", "1"], "link name 'udpin:x': "),
         (["", "1"], "no such file"),
