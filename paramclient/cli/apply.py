@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial as bind
 from typing import Annotated, ClassVar, Final, Self, TypeAlias
@@ -13,7 +15,8 @@ import anyio
 import anyio.to_thread
 from cyclopts import Parameter
 
-from paramclient.cli.cached import parse_when
+from paramclient import errors
+from paramclient.cli.cached import parse_time
 from paramclient.cli.json_output import JsonObject, apply_json, plan_json, row_json, rows_json
 from paramclient.cli.metadata import (
     MetadataChoice,
@@ -24,34 +27,13 @@ from paramclient.cli.metadata import (
     say_sources,
 )
 from paramclient.cli.options import ApplyFlags
-from paramclient.cli.output import (
-    LINE_NAMES_MAX,
-    Coloured,
-    ExitCode,
-    Status,
-    can_ask,
-    code_of,
-    confirm,
-    report,
-    say,
-)
+from paramclient.cli.output import Coloured, ExitCode, Status, can_ask, code_of, confirm, listed, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, check_given, get_chosen, sessions
 from paramclient.cli.set_command import STYLES, write_all
 from paramclient.cli.sources import check_pattern, described, fill_pattern, is_pattern_name, resolve_all
-from paramclient.errors import (
-    CacheError,
-    FileError,
-    NoReply,
-    NotInCache,
-    UnknownVehicle,
-    UsageError,
-    VehicleError,
-)
 from paramclient.files import FileFormat, ParamFile
-from paramclient.metadata import Metadata
-from paramclient.model.names import age_in_words, counted, first_of, is_pattern
+from paramclient.model.names import age_in_words, counted, is_pattern
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param
 from paramclient.provision.apply_restore import load_restore_point, restore_categories
 from paramclient.provision.apply_rules import CATEGORIES, READ_ONLY
 from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
@@ -64,6 +46,8 @@ _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be reve
 """Words for planned actions in the summary, where they differ from the status."""
 _INCLUDABLE: Final = frozenset(CATEGORIES) - {READ_ONLY}
 """Categories of left-out parameters that --include writes; the vehicle lets no client write the others."""
+_SNAPSHOT: Final = re.compile("[0-9]{1,18}")
+"""The number of a snapshot; all other texts are times."""
 _OPTIONS: Final = ApplyFlags()
 
 
@@ -138,12 +122,14 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
         load, options = await _from_file(when, options)
         return await _run(url, options, load, is_restore=True)
     if options.place is False:
-        raise UsageError("earlier states are in the cache, which --no-cache excludes; name a backup file")
-    moment = None if when is None else parse_when(when, time.time())
-    if isinstance(moment, int) and ChosenVehicle.parse(options.vehicle).is_all:
-        raise UsageError(
-            f"snapshot {when} is of one vehicle; with --vehicle all, give a time such as '2h ago'"
+        raise errors.UsageError(
+            "earlier states are in the cache, which --no-cache excludes; name a backup file"
         )
+    moment: float | int | None = None
+    if when is not None:
+        moment = int(when) if _SNAPSHOT.fullmatch(when) else parse_time(when, time.time())
+    if isinstance(moment, int) and ChosenVehicle.parse(options.vehicle).is_all:
+        raise errors.UsageError(f"snapshot {when} is of one vehicle; with --vehicle all, give a time")
     return await _run(url, options, bind(_earlier_state, moment), is_restore=True)
 
 
@@ -172,7 +158,7 @@ async def reset(
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
     """
     if bool(names) + all_ + changed != 1:
-        raise UsageError("reset takes names, or --all, or --changed")
+        raise errors.UsageError("reset takes names, or --all, or --changed")
     chosen = check_given(names)
     load = bind(_defaults, chosen or ["*"], metadata, only_known=changed)
     flags = replace(options, include=(*options.include, *(name.upper() for name in chosen)))
@@ -200,7 +186,7 @@ async def _from_file(name: str, options: ApplyFlags) -> tuple[Load, ApplyFlags]:
         if file is None and is_file(path := await fill_pattern(name, session)):
             file = read_source(path)
         if file is None:
-            raise FileError("no such file", source=path)
+            raise errors.FileError("no such file", source=path)
         params = choose(file, session.choice.component, session.component.system)
         await wait_for_identity(session.component)
         own, origin = session.component.identity, params.identity
@@ -221,7 +207,7 @@ async def _earlier_state(moment: float | int | None, session: CommandSession) ->
     """
     cache, vehicle = session.client.cache, session.component
     if cache is None:
-        raise NotInCache("earlier states are in the cache, which cannot be used")
+        raise errors.NotInCache("earlier states are in the cache, which cannot be used")
     await wait_for_identity(vehicle)
     await vehicle.core.cache_writer.write_all()
     place = (vehicle.identity.key, vehicle.component)
@@ -231,14 +217,14 @@ async def _earlier_state(moment: float | int | None, session: CommandSession) ->
         if moment is not None:
             return State(await anyio.to_thread.run_sync(read, moment))
         point = await anyio.to_thread.run_sync(find)
-    except NotInCache:
+    except errors.NotInCache:
         raise
-    except (CacheError, UnknownVehicle) as error:  # the user named no vehicle of the cache
+    except (errors.CacheError, errors.UnknownVehicle) as error:  # the user named no vehicle of the cache
         problem = f"nothing was sent, as no earlier state can be read: {error}"
         hint = "A backup file can be restored without the cache (--no-cache)"
-        raise CacheError(f"{problem}. {hint}") from error
+        raise errors.CacheError(f"{problem}. {hint}") from error
     when = f"{age_in_words(time.time() - point.at)} ago (snapshot {point.snapshot})"
-    changed = first_of([*point.changes], LINE_NAMES_MAX) or "nothing, as far as is known"
+    changed = listed([*point.changes]) or "nothing, as far as is known"
     say(f"{session.prefix}the state is that before the last apply, {when}; changed since then: {changed}")
     return State(point.state)
 
@@ -253,41 +239,26 @@ async def _defaults(
         ParamClientError: the vehicle has no such parameter, or does not answer.
     """
     missing = (await session.fetch()).missing
-    params, errors = await get_chosen(session, chosen, is_fetched=True)
-    for error in errors.values():
+    params, problems = await get_chosen(session, chosen, is_fetched=True)
+    for error in problems.values():
         raise error
-    known = await _described(session, choice, params)
+    known = await known_of_session(session, choice)
+    if known is None and any(param.default is None for param in params):
+        with suppress(errors.UsageError, errors.VehicleError, errors.NoReply):  # it gives no metadata
+            known = await request_from_vehicle(session)
     found = {param.name: default_in(known, param) for param in params}
     wanted = {name: default.value for name, default in found.items() if default is not None}
     if not wanted:
-        raise VehicleError(no_defaults(), *session.component.address)
+        raise errors.VehicleError(no_defaults(), *session.component.address)
     say_sources(session.label, found.values())
-    problems = []
+    gaps = []
     if missing and any(map(is_pattern, chosen)):
-        problems.append(f"incomplete: {counted(len(missing), 'parameter')} not received")
+        gaps.append(f"incomplete: {counted(len(missing), 'parameter')} not received")
     if (without := [name for name in found if name not in wanted]) and not only_known:
-        listed = first_of(without, LINE_NAMES_MAX)
-        problems.append(f"not written, as their default is not known: {listed}")
-    for problem in problems:
-        report(f"{session.prefix}{problem}")
-    return State(ParamSet(wanted, source="the firmware's defaults"), is_part=bool(problems))
-
-
-async def _described(
-    session: CommandSession, choice: MetadataChoice, params: Sequence[Param]
-) -> Metadata | None:
-    """Return the metadata of the vehicle, or None if there is none.
-
-    Without a choice of the user, it is downloaded only if the vehicle does not give a default.
-    """
-    found = await known_of_session(session, choice)
-    if found is not None or all(param.default is not None for param in params):
-        return found
-    try:
-        return await request_from_vehicle(session)
-    except (UsageError, VehicleError, NoReply) as error:
-        say(f"{session.label} gives no metadata with defaults: {error}")
-        return None
+        gaps.append(f"not written, as their default is not known: {listed(without)}")
+    for gap in gaps:
+        report(f"{session.prefix}{gap}")
+    return State(ParamSet(wanted, source="the firmware's defaults"), is_part=bool(gaps))
 
 
 # Plans and writes
@@ -338,13 +309,13 @@ async def _run(
                 options["backup"] = path = await fill_pattern(flags.backup, session)
                 if path in backups or await anyio.Path(path).exists():
                     message = "exists already, or is the backup of another vehicle; choose another name"
-                    raise FileError(message, source=path)
+                    raise errors.FileError(message, source=path)
                 backups.add(path)
             jobs[session] = _Job(session, state, options, is_restore)
 
         await found.work(prepare)
         for error in found.errors.values():
-            if isinstance(error, FileError):  # before anything is sent to another vehicle
+            if isinstance(error, errors.FileError):  # before anything is sent to another vehicle
                 raise error
         if flags.dry_run or (not flags.yes and not flags.json and can_ask()):
             plans = await found.work(lambda session: jobs[session].make_plan())
@@ -391,7 +362,7 @@ class _Job:
         with anyio.move_on_after(left):
             self.found = await plan(session.component, self.state.params, include=include, info=info)
             return self
-        raise NoReply(f"the parameters of {session.label}", attempts=0, waited=left or 0.0)
+        raise errors.NoReply(f"the parameters of {session.label}", attempts=0, waited=left or 0.0)
 
     async def write(self) -> Self:
         """Write, and return the job with its result."""
@@ -468,14 +439,14 @@ class _Job:
         if left_out := Counter(
             row.category for row in skipped if row.differs and row.category in _INCLUDABLE
         ):
-            listed = ", ".join(f"{count} {category}" for category, count in left_out.items())
+            counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
             options = " ".join(f"--include {category}" for category in left_out)
-            say(f"{label}: left out: {listed}; to write them: {options}")
+            say(f"{label}: left out: {counts}; to write them: {options}")
         if made.unchecked_note:
             say(f"{label}: {made.unchecked_note}")
         if to_reboot:
             verb = "reboots for" if reboots and found is made else "takes effect after a reboot"
-            say(f"{label}: {verb}: {first_of(to_reboot, LINE_NAMES_MAX)}")
+            say(f"{label}: {verb}: {listed(to_reboot)}")
         code = self._report_plan(found) if isinstance(found, Plan) else self._report_result(found)
         return max(code, ExitCode.INCOMPLETE) if self.state.is_part else code
 
@@ -490,7 +461,7 @@ class _Job:
             report(f"{label} is armed; nothing would be set now without --allow-armed")
             code = ExitCode.INCOMPLETE
         if self._is_refused(made):
-            names = first_of([*made.problems], LINE_NAMES_MAX)
+            names = listed([*made.problems])
             report(f"{label}: nothing would be sent without --partial: {names}")
             code = ExitCode.USAGE
         return code

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import date, datetime, timedelta, tzinfo
@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache, SnapshotSummary
-from paramclient.cli.json_output import history_json, known_members, snapshot_json, taken
+from paramclient.cli.json_output import JsonObject, history_json, known_members, snapshot_json, taken
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import ExitCode, local_time, print_json, print_line, report, report_all, say, show
+from paramclient.cli.output import local_time, print_result, report, report_all, say, show
 from paramclient.cli.session import check_given
 from paramclient.errors import FileError, LinkError, ParamClientError, UsageError
 from paramclient.files.conversion import kind_of
@@ -32,15 +32,9 @@ WHEN: Final = (
 )
 """The accepted formats of a time, for messages."""
 
-_UNITS: Final = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
-    **dict.fromkeys(("m", "min", "mins", "minute", "minutes"), 60.0),
-    **dict.fromkeys(("h", "hour", "hours"), 3600.0),
-    **dict.fromkeys(("d", "day", "days"), 86400.0),
-    **dict.fromkeys(("w", "week", "weeks"), 604800.0),
-}
-"""Seconds of each unit of time."""
-_LENGTH: Final = rf"([0-9]{{1,9}}(?:\.[0-9]{{1,9}})?) ?({'|'.join(_UNITS)})(?![a-z])"
+_UNITS: Final = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}
+"""Seconds of each unit of time, by its first letter."""
+_LENGTH: Final = r"([0-9]{1,9}(?:\.[0-9]{1,9})?) ?(s|sec|second|m|min|minute|h|hour|d|day|w|week)s?(?![a-z])"
 """A number with a unit, such as `30min`."""
 _AGO: Final = re.compile(rf"{_LENGTH}(?: ?{_LENGTH})*(?: ago)?", re.ASCII)
 """A time before now, such as `2h 30min ago`."""
@@ -51,23 +45,19 @@ _MOMENT: Final = re.compile(
     re.ASCII,
 )
 """A day, a time of day, or both, with or without a time zone."""
-_SNAPSHOT: Final = re.compile(r"[0-9]{1,18}", re.ASCII)
-"""The id of a snapshot."""
 KIND_BYTES: Final = 4096
 """Bytes at the beginning of a file that identify its format."""
 
 _DEFAULTS: Final = CacheOptions()
 
 
-def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
+def cache_list(*, options: CacheOptions = _DEFAULTS) -> None:
     """List the tables in the cache, most recently received vehicles first."""
     with ParamCache(options.cache) as cache:
-        summaries, sizes = cache.components(), extended_sizes(cache)
-    show_summaries(cache, summaries, sizes, json=options.json)
-    return ExitCode.DONE
+        show_summaries(cache, cache.components(), json=options.json)
 
 
-def cache_remove(vehicle: str, /, *, options: CacheOptions = _DEFAULTS) -> ExitCode:
+def cache_remove(vehicle: str, /, *, options: CacheOptions = _DEFAULTS) -> None:
     """Remove a vehicle from the cache: its tables and their history.
 
     Args:
@@ -77,23 +67,16 @@ def cache_remove(vehicle: str, /, *, options: CacheOptions = _DEFAULTS) -> ExitC
     with ParamCache(options.cache) as cache:
         key = tables_in(cache, vehicle)[0].key
         removed = cache.remove(key, component_of(vehicle))
-    if options.json:
-        print_json({"key": key, "removed": removed})
-    else:
-        print_line(f"removed {counted(removed, 'table')} of {key}")
-    return ExitCode.DONE
+    words = f"removed {counted(removed, 'table')} of {key}"
+    print_result({"key": key, "removed": removed}, words, json=options.json)
 
 
-def show_summaries(
-    cache: ParamCache,
-    summaries: Sequence[CachedSummary],
-    sizes: Mapping[tuple[str, int], int],
-    *,
-    json: bool = False,
-) -> None:
+def show_summaries(cache: ParamCache, summaries: Sequence[CachedSummary], *, json: bool) -> None:
     """Print a line for each table, with the number of extended parameters."""
-    components = [
-        {
+    sizes = {(each.key, each.component): each.size for each in cache.components(extended=True)}
+    components, rows = list[JsonObject](), list[Sequence[object]]()
+    for each in summaries:
+        found = {
             **taken(each, "key", "system", "component"),
             "autopilot": autopilot_name(each.autopilot),
             "uid": each.identity.uid,
@@ -103,27 +86,15 @@ def show_summaries(
             "updated_at": time_or_none(each.updated_at),
             **known_members(extended=sizes.get((each.key, each.component))),
         }
-        for each in summaries
-    ]
-    rows = (
-        [
-            f"{each.system}/{each.component}",
-            *map(found.get, ("autopilot", "size", "extended", "hash")),
-            each.synced_at and local_time(each.synced_at),
-            each.key,
-        ]
-        for each, found in zip(summaries, components, strict=True)
-    )
+        components.append(found)
+        synced = each.synced_at and local_time(each.synced_at)
+        members = map(found.get, ("autopilot", "size", "extended", "hash"))
+        rows.append([f"{each.system}/{each.component}", *members, synced, each.key])
     columns = ["component", "autopilot", "params", "extended", "hash", "synced", "key"]
-    found = {"path": cache.place, "components": components}
-    show(found, columns, rows, json=json, empty="no table is in the cache")
+    listed = {"path": cache.place, "components": components}
+    show(listed, columns, rows, json=json, empty="no table is in the cache")
     if not json:
         say(f"the cache is {cache.place}")
-
-
-def extended_sizes(cache: ParamCache) -> dict[tuple[str, int], int]:
-    """Return the number of extended parameters of each component that has some, by key and component."""
-    return {(each.key, each.component): each.size for each in cache.components(extended=True)}
 
 
 def load_tables(
@@ -202,7 +173,7 @@ def history(
     snapshots: bool = False,
     extended: bool = False,
     options: CacheOptions = _DEFAULTS,
-) -> ExitCode:
+) -> None:
     """Print the changes of a vehicle's values: time, old and new value, author. The newest change is last.
 
     With --snapshots, print the snapshots of the vehicle's tables instead, each with its number.
@@ -216,35 +187,33 @@ def history(
         snapshots: Print the snapshots instead of the changes.
         extended: Extended parameters (PARAM_EXT_*), such as a camera's.
     """
-    begin = None if since is None else parse_time(since, time.time())
-    if begin is not None and not options.json:
-        say(f"since {local_time(begin)}")
     if snapshots and names:
         raise UsageError("--snapshots lists whole tables and takes no parameter name")
+    chosen, begin = check_given(names), None if since is None else parse_time(since, time.time())
+    if begin is not None and not options.json:
+        say(f"since {local_time(begin)}")
     with ParamCache(options.cache) as cache:
         tables = tables_in(cache, vehicle, extended=extended)
         key, component = tables[0].key, component_of(vehicle)
-        if snapshots:
-            kept = cache.snapshots(key, component, extended=extended)
-            kept = [each for each in kept if begin is None or each.at >= begin]
-            show(
-                {"snapshots": [snapshot_json(each) for each in kept]},
-                ["id", "time", "component", "params", "hash", "reason"],
-                map(_snapshot_cells, kept),
-                json=options.json,
-                empty="no snapshots: apply and restore store one before they write",
-            )
-            return ExitCode.DONE
-        entries = cache.history(key, component, extended=extended)
-        known = {each.name for each in entries}
-        known.update(*(each.params for each in load_tables(cache, tables, extended=extended)))
-    chosen = NameChoice(check_given(names)).choose(known, f" of {key} in the cache") if names else known
-    entries = [each for each in entries if each.name in chosen and (begin is None or each.at >= begin)]
+        kept = cache.snapshots(key, component, extended=extended) if snapshots else []
+        entries = [] if snapshots else cache.history(key, component, extended=extended)
+        loaded = load_tables(cache, tables, extended=extended) if chosen else []
+    if snapshots:
+        kept = [each for each in kept if each.at >= (begin or 0)]
+        columns = ["id", "time", "component", "params", "hash", "reason"]
+        empty = "no snapshots: apply and restore store one before they write"
+        item = {"snapshots": [snapshot_json(each) for each in kept]}
+        show(item, columns, map(_snapshot_cells, kept), json=options.json, empty=empty)
+        return
+    if chosen:
+        known = {each.name for each in entries}.union(*(each.params for each in loaded))
+        selected = NameChoice(chosen).choose(known, f" of {key} in the cache")
+        entries = [each for each in entries if each.name in selected]
+    entries = [each for each in entries if each.at >= (begin or 0)]
     found = [history_json(each) for each in entries]
     members = ("component", "name", "old", "new", "by")
     rows = ([local_time(each.at), *map(line.get, members)] for each, line in zip(entries, found, strict=True))
     show({"history": found}, ["time", *members], rows, json=options.json)
-    return ExitCode.DONE
 
 
 def _snapshot_cells(each: SnapshotSummary) -> Sequence[object]:
@@ -256,22 +225,6 @@ def _snapshot_cells(each: SnapshotSummary) -> Sequence[object]:
 
 
 # Times
-
-
-def parse_when(text: str, now: float, zone: tzinfo | None = None) -> float | int:
-    """Parse an argument of `ParamCache.state_at`: a time in the past, or the id of a snapshot.
-
-    Args:
-        text: a number alone is the id of a snapshot; for all other texts see `parse_time`.
-        now: the current time in unix seconds.
-        zone: the time zone of times that name none; None for that of this computer.
-
-    Raises:
-        UsageError: the text is neither, or the time is in the future.
-    """
-    if _SNAPSHOT.fullmatch(text.strip()):
-        return int(text)
-    return parse_time(text, now, zone)
 
 
 def parse_time(text: str, now: float, zone: tzinfo | None = None) -> float:
@@ -290,7 +243,9 @@ def parse_time(text: str, now: float, zone: tzinfo | None = None) -> float:
     """
     words = " ".join(text.lower().split())
     try:
-        at = _before(words, now) if _AGO.fullmatch(words) else _moment(words, now, zone)
+        lengths = re.findall(_LENGTH, words) if _AGO.fullmatch(words) else []
+        ago = sum(float(number) * _UNITS[unit[0]] for number, unit in lengths)
+        at = now - ago if lengths else _moment(words, now, zone)
     except (ValueError, OverflowError, OSError):  # the 30th of February; the year 0
         at = None
     if at is None or at < 0:
@@ -298,10 +253,6 @@ def parse_time(text: str, now: float, zone: tzinfo | None = None) -> float:
     if at > now:
         raise UsageError(f"{text!r} is in the future")
     return at
-
-
-def _before(words: str, now: float) -> float:
-    return now - sum(float(number) * _UNITS[unit] for number, unit in re.findall(_LENGTH, words))
 
 
 def _moment(words: str, now: float, zone: tzinfo | None) -> float | None:

@@ -23,6 +23,7 @@ import anyio.to_thread
 
 from paramclient import errors
 from paramclient.errors import ParamClientError
+from paramclient.model.names import first_of
 from paramclient.model.values import Param
 from paramclient.protocol.fetch import Progress
 
@@ -90,6 +91,11 @@ def local_time(at: float) -> str:
 def by_index(params: Iterable[Param]) -> list[Param]:
     """Return parameters in the vehicle's order; those without an index last, by name."""
     return sorted(params, key=lambda param: (param.index is None, param.index or 0, param.name))
+
+
+def listed(words: Sequence[object]) -> str:
+    """Return the first words, such as names of parameters, and the number of further ones."""
+    return first_of(words, LINE_NAMES_MAX)
 
 
 # Lines

@@ -16,13 +16,12 @@ from cyclopts.validators import Number
 from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
 from paramclient.cli.metadata import MetadataChoice, info_of, known_of_session
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import LINE_NAMES_MAX, Coloured, Status, code_of, report, require_consent, say
+from paramclient.cli.output import Coloured, Status, code_of, listed, report, require_consent, say
 from paramclient.cli.session import CommandSession, Sessions, Shown, sessions, spelling
 from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.metadata.info import ParamInfo, number_of
-from paramclient.model.names import first_of
 from paramclient.model.values import ParamType, Value, check_name, format_value, parse_ext_value
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 
@@ -90,12 +89,11 @@ def _parse_pairs(words: Sequence[str]) -> dict[str, str]:
         if word.startswith("-"):  # values may be negative, so that an unknown option would be a name
             raise UsageError(f"Unknown option: {word.partition('=')[0]}. Nothing was written.")
         name, equals, text = word.partition("=")
-        value = text if equals else next(left, None)
-        if value is None:
+        if not equals and (text := next(left, "")) == "":
             raise UsageError(f"set takes pairs of NAME and VALUE, or NAME=VALUE, and {name} has no value")
         if check_name(name) in pairs:
             raise UsageError(f"{name} is given twice")
-        pairs[name] = value
+        pairs[name] = text
     if not pairs:
         raise UsageError("set takes pairs of NAME and VALUE, or NAME=VALUE")
     return pairs
@@ -273,7 +271,7 @@ class SetJob:
                 else:
                     errors[each.name] = text if each.name in text else f"{each.name}: {text}"
         if late:
-            say(f"{prefix}takes effect after a reboot: {first_of(late, LINE_NAMES_MAX)}")
+            say(f"{prefix}takes effect after a reboot: {listed(late)}")
         for text in errors.values():
             report(f"{prefix}{text}")
         codes = [code_of(each.error) for each in self.arrived.values() if each.error is not None]

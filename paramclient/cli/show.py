@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
-from paramclient.cli.cached import extended_sizes, load_tables, show_summaries
+from paramclient.cli.cached import load_tables, show_summaries
 from paramclient.cli.json_output import (
     JsonObject,
     info_json,
@@ -81,7 +81,7 @@ async def show(
         if vehicle is None:
             summaries = cache.components(extended=extended)
             if len(summaries) != 1:
-                show_summaries(cache, summaries, extended_sizes(cache), json=options.json)
+                show_summaries(cache, summaries, json=options.json)
                 return ExitCode.DONE
             vehicle = f"cache:{summaries[0].key}"
         check_link(link_of(vehicle))

@@ -8,11 +8,11 @@ from typing import Annotated, Final
 
 from cyclopts import Parameter
 
+from paramclient.cli.json_output import taken
 from paramclient.cli.options import CONNECTION, KeyOptions, Seconds, Verbose
-from paramclient.cli.output import can_ask, confirm, print_result
+from paramclient.cli.output import print_result, require_consent
 from paramclient.cli.session import ChosenVehicle, Deadline, wait_for_vehicle
 from paramclient.client.client import ParamClient
-from paramclient.client.component import Component
 from paramclient.client.signing import Signing, read_key
 from paramclient.errors import NoReply, UsageError, VehicleError
 from paramclient.links import Link, create_link
@@ -81,35 +81,42 @@ async def disable(url: str, /, *, options: SigningTarget = _DEFAULTS) -> None:
 async def _change(
     url: str, options: SigningTarget, key: SigningKey | None, present: SigningKey | None, consequence: str
 ) -> None:
-    """Send SETUP_SIGNING with a key or with none, signed with the present one if known, and verify it."""
+    """Send SETUP_SIGNING with a key or with none, signed with the present one if known, and verify it.
+
+    Raises:
+        VehicleError: the vehicle does not answer afterwards, or has not changed its signing.
+    """
     choice = ChosenVehicle.parse(options.vehicle, one="a signing key is set on one vehicle at a time")
     if not options.link_is_safe:
-        if not can_ask():
-            raise UsageError(
-                "nothing was sent; add --link-is-safe if no other person or program can listen on this link"
-            )
-        question = "Can no other person or program listen or send on this link?"
-        if not await confirm(f"{consequence} {question}"):
-            raise UsageError("nothing was sent")
+        question = f"{consequence} Can no other person or program listen or send on this link?"
+        hint = "add --link-is-safe if no other person or program can listen on this link"
+        await require_consent(question, hint)
     deadline, link = Deadline(options.timeout), create_link(url)
     async with _client(link, options, present) as client:
         vehicle = await wait_for_vehicle(client, choice, deadline, only=True)
         await vehicle.setup_signing(key, link_is_safe=True)
-        address = vehicle.address
+        address, name = vehicle.address, f"{vehicle.system}/{vehicle.component}"
     async with _client(link, options, key) as client:
-        vehicle = await _read_value(client, address, deadline, is_signed=key is not None)
-        report, before = client.signing_report(), _count_signed(client, address)
-        if key is None:
-            await _read_value(client, address, deadline, is_signed=False)
-            if _count_signed(client, address) > before:
-                raise _refused(address, "still signs; it may require its present key, see --signing-key")
-        elif report is None or address not in {(each.system, each.component) for each in report.streams}:
-            raise _refused(address, "answers, but does not sign with the key: it has not accepted the key")
-    name = {"system": vehicle.system, "component": vehicle.component, "autopilot": vehicle.autopilot}
-    found = name | {"signs": key is not None, "fingerprint": key and key.fingerprint}
+        try:
+            vehicle = await client.component(*address, timeout=deadline.left(PROOF_TIMEOUT))
+            await vehicle.get(0, timeout=deadline.left(PROOF_TIMEOUT))
+            before = _count_signed(client, address)
+            await vehicle.get(0, timeout=deadline.left(PROOF_TIMEOUT))
+        except NoReply:
+            requests = "unsigned requests" if key is None else "requests signed with the key"
+            raise VehicleError(f"{name} does not answer {requests}", *address) from None
+        report = client.signing_report()
+        proven = [(each.system, each.component) for each in report.streams] if report else []
+        if key is not None and address not in proven:
+            failure = "answers, but does not sign with the key: it has not accepted the key"
+            raise VehicleError(f"{name} {failure}", *address)
+        if key is None and _count_signed(client, address) > before:
+            failure = "still signs; it may require its present key, see --signing-key"
+            raise VehicleError(f"{name} {failure}", *address)
+    found = taken(vehicle, "system", "component", "autopilot")
+    found |= {"signs": key is not None, "fingerprint": key and key.fingerprint}
     state = "no longer signs" if key is None else f"signs with the key {key.fingerprint} now"
-    words = f"{vehicle.system}/{vehicle.component} {vehicle.autopilot} {state}"
-    print_result(found, words, json=options.json)
+    print_result(found, f"{name} {vehicle.autopilot} {state}", json=options.json)
 
 
 def _client(link: Link, options: SigningTarget, key: SigningKey | None) -> ParamClient:
@@ -117,27 +124,6 @@ def _client(link: Link, options: SigningTarget, key: SigningKey | None) -> Param
     return ParamClient(link, cache=False, traffic=True, signing=signing, system=options.source_system)
 
 
-async def _read_value(
-    client: ParamClient, address: tuple[int, int], deadline: Deadline, *, is_signed: bool
-) -> Component:
-    """Read a value of the vehicle with the signing of the client; return the vehicle.
-
-    Raises:
-        VehicleError: the vehicle did not answer.
-    """
-    try:
-        vehicle = await client.component(*address, timeout=deadline.left(PROOF_TIMEOUT))
-        await vehicle.get(0, timeout=deadline.left(PROOF_TIMEOUT))
-    except NoReply:
-        requests = "requests signed with the key" if is_signed else "unsigned requests"
-        raise _refused(address, f"does not answer {requests}") from None
-    return vehicle
-
-
 def _count_signed(client: ParamClient, address: tuple[int, int]) -> int:
     components = client.traffic_report().components
     return sum(each.totals["signed"] for each in components if (each.system, each.component) == address)
-
-
-def _refused(address: tuple[int, int], failure: str) -> VehicleError:
-    return VehicleError(f"{address[0]}/{address[1]} {failure}", *address)

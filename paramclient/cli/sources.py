@@ -22,9 +22,9 @@ from paramclient.cli.metadata import (
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
-    LINE_NAMES_MAX,
     Coloured,
     ExitCode,
+    listed,
     local_time,
     print_json,
     print_table,
@@ -35,11 +35,11 @@ from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
 from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, writable, write_file
 from paramclient.files.formats import ENDINGS, address, format_of_name
-from paramclient.links import FORMS, LinkKind, parse_link
+from paramclient.links import LinkKind, parse_link
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import ChangedSide, compare
 from paramclient.model.identity import autopilot_name
-from paramclient.model.names import NameChoice, counted, first_of
+from paramclient.model.names import NameChoice, counted
 from paramclient.model.paramset import ParamSet, default_of
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.sources import (
@@ -53,14 +53,6 @@ from paramclient.provision.sources import (
     select_non_defaults,
 )
 
-SOURCES: Final = f"""\
-  FILE                a parameter file or a log (.bin, .ulg, .tlog) that exists; - for the standard input
-  cache:VEHICLE       the cached table of a vehicle: 4 or 4/1, px4 or ardupilot, its hardware id (in full,
-                      or uid: and at least 6 digits), or its key; cache: may be left out
-{FORMS}"""
-"""The accepted sources, for messages."""
-PLACEHOLDERS: Final = ("{uid}", "{system}")
-"""Placeholders in file names, which are replaced by the ids of the vehicle."""
 _ENDINGS: Final = frozenset({*ENDINGS, ".bin", ".ulg", ".txt", ".csv"})
 """Extensions of files with parameters, also of formats that are not readable: a text with one of them is
 meant as a file, and no link name has one."""
@@ -149,8 +141,8 @@ def check_link(text: str) -> None:
     """Check that an argument that is neither a file nor a cached vehicle names a link.
 
     Raises:
-        UsageError: it does not; the message lists the accepted sources, unless the text is the name of a
-            file that does not exist.
+        UsageError: it does not; the message lists the links, unless the text is the name of a file that does
+            not exist.
     """
     try:
         if not is_offline(text):
@@ -158,8 +150,7 @@ def check_link(text: str) -> None:
     except UsageError as error:
         if PurePath(text).suffix.lower() in _ENDINGS:
             raise UsageError(f"no such file: {text}") from None
-        problem = f"no such file, and no cached vehicle; {str(error).splitlines()[0]}"
-        raise UsageError(f"{problem}\naccepted sources:\n{SOURCES}") from None
+        raise UsageError(f"no such file, nor a vehicle in the cache (cache:VEHICLE); {error}") from None
 
 
 def part_of(params: ParamSet, names: Container[str]) -> ParamSet:
@@ -222,8 +213,7 @@ async def save(
         uid = None if each.identity is None else each.identity.uid
         kept, left_out = writable(each, written)
         if left_out:
-            listed = first_of(left_out, LINE_NAMES_MAX)
-            report(f"{address(each)}: left out, as only a .json file can hold them: {listed}")
+            report(f"{address(each)}: left out, as only a .json file can hold them: {listed(left_out)}")
         files.setdefault(filled(str(file), each.system, uid, address(each)), []).append(kept)
     found: list[JsonObject] = []
     for path, of_file in files.items():
@@ -375,7 +365,7 @@ def noun_of(params: ParamSet) -> str:
 
 def is_pattern_name(name: str) -> bool:
     """Return whether a file name has a placeholder for the ids of the vehicle."""
-    return any(place in name for place in PLACEHOLDERS)
+    return "{uid}" in name or "{system}" in name
 
 
 def check_pattern(what: str, pattern: str | None, options: LinkOptions) -> None:
@@ -386,9 +376,7 @@ def check_pattern(what: str, pattern: str | None, options: LinkOptions) -> None:
     """
     is_all = ChosenVehicle.parse(options.vehicle).is_all
     if pattern is not None and is_all and not is_pattern_name(pattern):
-        raise UsageError(
-            f"with --vehicle all, {what} needs {' or '.join(PLACEHOLDERS)} in its name: {pattern}"
-        )
+        raise UsageError(f"with --vehicle all, {what} needs {{uid}} or {{system}} in its name: {pattern}")
 
 
 async def fill_pattern(pattern: str, session: CommandSession) -> str:

@@ -158,9 +158,8 @@ def test_only_compares_the_named_parameters(command: Command) -> None:
     [
         (["9", "1"], "9 is not in the cache"),
         (["1", "1", "--vehicle", "1/9"], "which has 1/1 (uid:aa00000000000001)"),
-        (["quad", "1"], "no such file, and no cached vehicle; link name 'quad': the kind of link is missing"),
+        (["quad", "1"], "nor a vehicle in the cache (cache:VEHICLE); link name 'quad': the kind of link is"),
         (["quad.params", "1"], "paramclient: no such file: quad.params\n"),
-        (["1", "2", "--base", "quad"], "  cache:VEHICLE "),
         (["udpin:x", "1"], "link name 'udpin:x': "),
         (["", "1"], "no such file"),
         (["cache:", "1"], "needs a name"),
