@@ -40,8 +40,8 @@ CLOSE_TIMEOUT: Final = 2.0
 """Seconds for the closing of a session, also when its reader is cancelled. ArduPilot has one session for all
 links: an open one blocks the file access of all stations for 3 s."""
 BURST_PAUSE_MIN: Final = 0.3
-"""Seconds before the first block after which a burst counts as lost: at 57600 baud, ArduPilot begins one 95 to
-170 ms after the request (measured), and another request has it send the whole file again."""
+"""Seconds before the first block after which a burst counts as lost: at 57600 baud, ArduPilot begins one 95
+to 170 ms after the request (measured), and another request has it send the whole file again."""
 BLOCK_PAUSE_MIN: Final = 0.05
 """Seconds without a further block after which a burst counts as over."""
 BLOCK_INTERVALS: Final = 8

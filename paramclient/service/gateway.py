@@ -150,26 +150,30 @@ class Gateway:
                 return
         if not station.endpoint.is_readonly or _is_harmless(frame, message):
             self._pass(station, seen)
-            if isinstance(message, ListRequest):
-                station.list_passed_at = anyio.current_time()
             if getattr(message, "command", None) == messages.MAV_CMD_PREFLIGHT_STORAGE:
                 for link in self.links:
                     for table in link.tables(_target_of(frame), COMP_ID_ALL, extended=False):
                         table.component.watch.doubt()  # it may reset all, which PX4 does not announce
 
     def _answer(self, station: GroundStation, source: Source, message: Request, seen: SeenFrame) -> bool:
-        """Answer a request about parameters; return False for one that passes to the vehicles."""
+        """Answer a request about parameters; return False for one that passes to the vehicles.
+
+        One to whichever vehicle passes if there are several. Before one is heard, such a request does not
+        pass: the vehicle would send its list, or open its file, beside the gateway's own fetch.
+        """
         address = (message.target_system, message.target_component)
         extended = isinstance(message, EXTENDED_REQUESTS)
         found = {table: link for link in self.links for table in link.tables(*address, extended=extended)}
         served = [table for table, link in found.items() if self._serves(station, table, link)]
         systems = {table.source[0] for table in found}
         if not served or (len(systems) > 1 and not isinstance(message, ListRequest)):
-            return False  # if it is for whichever vehicle, they answer themselves
+            if isinstance(message, ListRequest):
+                station.list_asked_at = anyio.current_time()
+            return not (found or message.target_system)
         present = [table for table in served if not table.is_lost]
         autopilots = [table for table in present if table.source[1] == messages.AUTOPILOT_COMPONENT]
         one = (autopilots or present)[:1]  # that answers a request which all components receive
-        may_write = station.may_sign or not any(link.is_signed for link in found.values())
+        may_write = station.may_sign or not any(link.client.signing_report() for link in found.values())
         asker = Asker(station, *source, may_write)
         match message:
             case messages.ParamRequestList() | messages.ParamExtRequestList():
@@ -219,6 +223,8 @@ class VehicleLink(Tap):
         client: of the link.
 
     Attributes:
+        client: as given.
+        send: sends a frame of a station to the vehicles.
         systems: the system ids that were heard.
         signing: the components that sign.
         file: returns the parameter file of a table.
@@ -228,15 +234,11 @@ class VehicleLink(Tap):
         self.systems: set[int] = set()
         self.signing: set[Source] = set()
         self._gateway = gateway
-        self._client = client
+        self.client = client
+        self.send = client.core.link_task.forward
         self._station = client.core.station
         self._tables: dict[Session, KeptTable] = {}
         self.file = cache(KeptFile)
-
-    @property
-    def is_signed(self) -> bool:
-        """Whether the client signs what it sends."""
-        return self._client.signing_report() is not None
 
     async def run(self) -> None:
         """Take part in the gateway while the client is open."""
@@ -254,10 +256,6 @@ class VehicleLink(Tap):
     def sent(self, frame: bytes) -> None:
         """Take note of a frame to the vehicles."""
         self._gateway.copies.sent_up(frame)
-
-    def send(self, data: bytes) -> None:
-        """Send a frame of a station to the vehicles."""
-        self._client.core.link_task.forward(data)
 
     def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
         """Pass the frames of a chunk on; the client has taken them before."""
@@ -310,7 +308,7 @@ class VehicleLink(Tap):
     def _table(self, node: Node, *, extended: bool) -> KeptTable:
         session = node.extended if extended else node.plain
         if session not in self._tables:
-            component = self._client.components[node.system, node.component]
+            component = self.client.components[node.system, node.component]
             announce = partial(self._gateway.announce, self)
             self._tables[session] = KeptTable(component.ext if extended else component, announce)
         return self._tables[session]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import anyio
 
@@ -16,7 +16,7 @@ from paramclient.protocol.checksum import CHECKED_READ_SIZE, may_be_rounded
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode
 from paramclient.protocol.session import Session
-from paramclient.service.kept_table import Asker, KeptTable
+from paramclient.service.kept_table import Asker, KeptTable, Pending
 from paramclient.wire.messages import FileTransfer
 
 ENTRY_SIZE: Final = 12
@@ -25,7 +25,10 @@ FILE_WAIT: Final = 2.5
 """Seconds that the opening of the file waits for a fetch; then there is no such file, and the station asks
 for the list, which it gets as it is fetched. QGroundControl asks three times, 1 s apart."""
 OPEN_FILES_MAX: Final = 64
-"""Files that stations have open of one component, at most; the oldest is closed first."""
+"""Files that a station has open, at most; the oldest is closed first."""
+
+SessionKey: TypeAlias = tuple[Hashable, ...]
+"""What names a session of a station: what answers it, the ids of the sender, and the number."""
 
 
 class FileQuery(NamedTuple):
@@ -112,11 +115,11 @@ def answers_of(request: Packet, content: bytes) -> Iterator[Packet]:
 
 @dataclass(slots=True)
 class _OpenFile:
-    """A file that a station has open; `sequence` of its opening, `content` from the first read on."""
+    """A file that a station has open; `content` from the first read on."""
 
+    opening: Packet
     query: FileQuery
     rows: Rows
-    sequence: int
     content: bytes | None = None
 
 
@@ -132,9 +135,7 @@ class KeptFile:
     def __init__(self, table: KeptTable) -> None:
         self._table = table
         self._rows_at = lru_cache(1)(lambda state: rows_of(table.session))
-        self._open: dict[Hashable, _OpenFile] = {}
-        self._opening: set[Hashable] = set()
-        self._uploads: set[Hashable] = set()
+        self._opening = Pending[tuple[Asker, Packet]]()
 
     def take(self, asker: Asker, payload: bytes, route: Callable[[], None]) -> bool:
         """Answer a request; return False for one that the vehicle has to answer.
@@ -144,65 +145,71 @@ class KeptFile:
             payload: of the message.
             route: passes the request to the vehicle.
         """
-        request = Packet.unpack(payload)
-        key = (asker, request.session)
+        request, files = Packet.unpack(payload), asker.station.files
+        key = (self, asker.system, asker.component, request.session)
         match request.opcode:
             case Opcode.OPEN_FILE_RO | Opcode.CALC_FILE_CRC32:
-                return self._begin(asker, request, route)
-            case Opcode.READ_FILE | Opcode.BURST_READ_FILE if key in self._open:
-                self._send(asker, request, self._open[key])
+                return self._begin(asker, request, key, route)
+            case Opcode.READ_FILE | Opcode.BURST_READ_FILE if isinstance(files.get(key), _OpenFile):
+                self._send(asker, request, files[key])
                 return True
-            case Opcode.CREATE_FILE | Opcode.OPEN_FILE_WO if FileQuery.of(request) is not None:
-                if len(self._uploads) < OPEN_FILES_MAX:
-                    self._uploads.add(key)
+            case Opcode.CREATE_FILE | Opcode.OPEN_FILE_WO:
+                self._keep(asker, key, FileQuery.of(request))
             case Opcode.TERMINATE_SESSION | Opcode.RESET_SESSIONS:
-                if key in self._uploads:
-                    self._uploads.remove(key)
+                same = 3 if request.opcode == Opcode.RESET_SESSIONS else 4  # members of the key
+                closed = [files.pop(each) for each in list(files) if each[:same] == key[:same]]
+                if any(isinstance(each, FileQuery) for each in closed):
                     self._table.component.watch.doubt()
-                if self._open.pop(key, None) is not None:
+                is_aboard = not all(isinstance(each, _OpenFile) for each in closed)
+                if not is_aboard and (closed or (self._is_served and self._table.is_loading)):
                     self._say(asker, reply(request))
                     return True
         return False
 
-    def _begin(self, asker: Asker, request: Packet, route: Callable[[], None]) -> bool:
+    def _keep(self, asker: Asker, key: SessionKey, file: _OpenFile | FileQuery | None) -> None:
+        """Note what a session has open: a file here, or one on the vehicle; an upload with its query."""
+        files = asker.station.files
+        files.pop(key, None)
+        files[key] = file
+        if len(files) > OPEN_FILES_MAX:
+            del files[next(iter(files))]
+
+    def _begin(self, asker: Asker, request: Packet, key: SessionKey, route: Callable[[], None]) -> bool:
         """Open the file, or answer its checksum; wait for a fetch that may bring the table."""
-        key, query = (asker, request.session), FileQuery.of(request)
-        opened = self._open.pop(key, None) if request.opcode == Opcode.OPEN_FILE_RO else None
-        if opened is not None and (opened.query, opened.sequence) == (query, request.sequence):
-            self._open[key] = opened
-            self._say(asker, _opened(request, opened.rows))
+        query, file = FileQuery.of(request), asker.station.files.get(key)
+        is_checksum = request.opcode == Opcode.CALC_FILE_CRC32
+        if isinstance(file, _OpenFile) and file.opening == request:
+            self._say(asker, _opened(request, file.rows))
             return True
-        if query is None or not self._is_served:
-            return False
-        if request.opcode == Opcode.CALC_FILE_CRC32 and query.with_defaults:
-            return False  # a vehicle may send a default that is the value, which the table does not keep
-        if self._table.list_if_current is None:
-            opening = (key, request.opcode, request.sequence)
-            if opening not in self._opening:
-                self._opening.add(opening)
-                self._table.component.core.spawn(self._begin_later, opening, asker, request, route)
+        # a vehicle may send a default that is the value, which the table does not keep
+        is_here = query is not None and self._is_served and not (is_checksum and query.with_defaults)
+        if is_here and self._table.list_if_current is None:
+            if self._opening.begins((asker, request), asker):
+                self._table.component.core.spawn(self._begin_later, asker, request, key, route)
             return True
-        rows = self._rows_at(self._table.state_key)
-        if rows is None or query.start >= len(rows.entries):
+        rows = self._rows_at(self._table.state_key) if is_here else None
+        if query is None or rows is None or query.start >= len(rows.entries):
+            if not is_checksum:
+                self._keep(asker, key, None)
             return False
         self._table.check()
-        if request.opcode == Opcode.CALC_FILE_CRC32:
+        if is_checksum:
             checksum = crc32_px4(rows.content(query, CHECKED_READ_SIZE))
             self._say(asker, reply(request, checksum.to_bytes(4, "little")))
             return True
-        self._open[key] = _OpenFile(query, rows, request.sequence)
-        if len(self._open) > OPEN_FILES_MAX:
-            del self._open[next(iter(self._open))]
+        self._keep(asker, key, _OpenFile(request, query, rows))
         self._say(asker, _opened(request, rows))
         return True
 
     async def _begin_later(
-        self, opening: Hashable, asker: Asker, request: Packet, route: Callable[[], None]
+        self, asker: Asker, request: Packet, key: SessionKey, route: Callable[[], None]
     ) -> None:
-        with anyio.move_on_after(FILE_WAIT):
-            await self._table.load().wait()
-        self._opening.discard(opening)
-        if self._table.list_if_current is not None and self._begin(asker, request, route):
+        try:
+            with anyio.move_on_after(FILE_WAIT):
+                await self._table.load().wait()
+        finally:
+            self._opening.end((asker, request))
+        if self._table.list_if_current is not None and self._begin(asker, request, key, route):
             return
         if self._table.is_loading and request.opcode == Opcode.OPEN_FILE_RO:
             self._say(asker, reply(request, error=FileErrorCode.FILE_NOT_FOUND))

@@ -28,7 +28,7 @@ from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 from paramclient.protocol.table import Change
 from paramclient.protocol.watch import SyncState
-from paramclient.service.stations import GroundStation
+from paramclient.service.stations import REQUESTS_MAX, GroundStation
 from paramclient.wire import messages
 from paramclient.wire.messages import HASH_CHECK, NO_INDEX, Message
 
@@ -51,9 +51,7 @@ SET_TIMEOUT: Final = 2.9
 ASKED_AT_ONCE: Final = 4
 """Reads by stations that the vehicle is asked for at once."""
 TAKE_OVER_TIME: Final = 10.0
-"""Seconds in which a list that was passed to a vehicle may still be in progress."""
-PENDING_MAX: Final = 1_000
-"""Reads, and sets, that wait for one component, at most; further ones are dropped, as on a full link."""
+"""Seconds after which a list that was asked before the vehicle was heard is not expected any more."""
 REMEMBERED_TIME: Final = 30.0
 """Seconds for which a name that the vehicle does not have is remembered, and for which requests pass to a
 component that did not answer the gateway's own fetch."""
@@ -90,6 +88,25 @@ class Asker(NamedTuple):
     system: int
     component: int
     may_write: bool
+
+
+class Pending(dict[Key, set[Asker]]):
+    """Requests that wait, each with all who ask it."""
+
+    def begins(self, key: Key, asker: Asker) -> bool:
+        """Add one who asks, unless its station waits for too much; return whether it is the first one."""
+        if asker in self.get(key, ()) or asker.station.waiting >= REQUESTS_MAX:
+            return False
+        asker.station.waiting += 1
+        self.setdefault(key, set()).add(asker)
+        return len(self[key]) == 1
+
+    def end(self, key: Key) -> set[Asker]:
+        """Remove a request, and return who asked it."""
+        askers = self.pop(key)
+        for each in askers:
+            each.station.waiting -= 1
+        return askers
 
 
 # Messages from parameters
@@ -181,8 +198,8 @@ class KeptTable(Stream[Change]):
         self._list_at = lru_cache(1)(lambda state: whole_list(component.session))
         self._unserved_until = -math.inf
         self._unknown: dict[Which, float] = {}
-        self._reads: dict[Which, set[Asker]] = {}
-        self._sets: dict[SetKey, set[Asker]] = {}
+        self._reads = Pending[Which]()
+        self._sets = Pending[SetKey]()
         self._listing: dict[GroundStation, set[int]] = {}  # for a list, and the indices that each has
         self._listing_count: int | None = None
         self._loaded: anyio.Event | None = None  # while a fetch runs
@@ -254,9 +271,9 @@ class KeptTable(Stream[Change]):
             self.load()
 
     def take_over(self, station: GroundStation) -> None:
-        """Answer a list that was passed to the vehicle, and whose values are withheld from now on."""
-        if anyio.current_time() - station.list_passed_at < TAKE_OVER_TIME:
-            station.list_passed_at = -math.inf
+        """Answer a list that was asked before, now that the vehicle is heard and its values are withheld."""
+        if anyio.current_time() - station.list_asked_at < TAKE_OVER_TIME:
+            station.list_asked_at = -math.inf
             self.send_list(station)
 
     def _stream(self, station: GroundStation, values: Iterable[ReportedValue], sent: set[int]) -> None:
@@ -339,8 +356,8 @@ class KeptTable(Stream[Change]):
             asker.station.say(value, self.source)
         elif self._is_unknown(which):
             self._refuse([asker], which, ParamErrorCode.DOES_NOT_EXIST)
-        elif _begins(self._reads, which, asker):
-            self.component.core.spawn(self._read, which)
+        elif self._reads.begins(which, asker):
+            self.component.core.spawn(self._read, which, asker.station.reading)
 
     def known(self, which: Which) -> ReportedValue | None:
         """Return a value that is known to be the vehicle's, by name or index."""
@@ -356,10 +373,10 @@ class KeptTable(Stream[Change]):
         is_listed = is_beyond and self.list_if_current is not None
         return is_listed or self._unknown.get(which, -math.inf) > anyio.current_time()
 
-    async def _read(self, which: Which) -> None:
+    async def _read(self, which: Which, turns: anyio.CapacityLimiter) -> None:
         try:
             with anyio.move_on_after(READ_TIMEOUT):
-                value = await self._find(which)
+                value = await self._find(which, turns)
                 self._say(self._reads[which], value)
         except (errors.UnknownParameter, errors.Refused) as error:
             if len(self._unknown) >= UNKNOWN_NAMES_MAX:
@@ -367,9 +384,9 @@ class KeptTable(Stream[Change]):
             self._unknown[which] = anyio.current_time() + REMEMBERED_TIME
             self._refuse(self._reads[which], which, _code_of(error))
         finally:
-            del self._reads[which]
+            self._reads.end(which)
 
-    async def _find(self, which: Which) -> ReportedValue:
+    async def _find(self, which: Which, turns: anyio.CapacityLimiter) -> ReportedValue:
         """Wait for the value if a fetch may bring it; then ask the vehicle.
 
         An index is a gap in a station's list, which the fetch closes. A hash is asked for at once:
@@ -382,7 +399,7 @@ class KeptTable(Stream[Change]):
         known = self.known(which)
         if known is not None:
             return known
-        async with self._asking:
+        async with turns, self._asking:
             value = await read(self.session, which)
         return value._replace(param_id=which) if isinstance(which, str) else value
 
@@ -393,18 +410,19 @@ class KeptTable(Stream[Change]):
             self._reject([asker], key, ParamErrorCode.READ_ONLY)
         elif not asker.may_write:
             self._reject([asker], key, ParamErrorCode.PERMISSION_DENIED)
-        elif _begins(self._sets, key, asker):
-            self.component.core.spawn(self._set, key, f"station {asker.system}/{asker.component}")
+        elif self._sets.begins(key, asker):
+            self.component.core.spawn(self._set, key, asker)
 
-    async def _set(self, key: SetKey, author: str) -> None:
-        askers, code = self._sets[key], int(NO_ANSWER)
+    async def _set(self, key: SetKey, first: Asker) -> None:
+        code = int(NO_ANSWER)
         try:
             with anyio.move_on_after(SET_TIMEOUT):
-                code = await self._write(*key, author)
+                async with first.station.writing:
+                    code = await self._write(*key, f"station {first.system}/{first.component}")
         except ParamClientError as error:
             code = _code_of(error)
         finally:
-            del self._sets[key]
+            askers = self._sets.end(key)
         if code:
             self._reject(askers, key, code)
 
@@ -457,14 +475,6 @@ class KeptTable(Stream[Change]):
         for station, system, component, _ in askers:
             if not (self.session.dialect.has_ack or self.is_lost):
                 station.say(messages.ParamError(system, component, name, index, code), self.source)
-
-
-def _begins(pending: dict[Key, set[Asker]], key: Key, asker: Asker) -> bool:
-    """Add an asker to those who wait for a read or a set; return whether it is the first, and to be done."""
-    is_first = key not in pending and len(pending) < PENDING_MAX
-    if is_first or key in pending:
-        pending.setdefault(key, set()).add(asker)
-    return is_first
 
 
 def _code_of(error: ParamClientError) -> int:

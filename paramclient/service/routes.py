@@ -485,9 +485,8 @@ def _context(author: str, target: Target) -> dict[str, Any]:
 @reading.get(f"{VEHICLE}/snapshots")
 async def snapshots(target: TargetArgument) -> JsonObject:
     """Return the snapshots, the newest last."""
-    return {
-        "snapshots": [json_output.snapshot_json(each) for each in await target.cached(ParamCache.snapshots)]
-    }
+    found = await target.cached(ParamCache.snapshots)
+    return {"snapshots": [json_output.snapshot_json(each) for each in found]}
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
@@ -496,9 +495,8 @@ async def create_snapshot(target: TargetArgument, body: SnapshotRequest) -> Json
     if not target.component.params:
         raise UsageError("no parameter of the vehicle is known")
     await target.component.core.cache_writer.write_all()
-    return json_output.snapshot_json(
-        await target.cached(partial(ParamCache.store_snapshot, reason=body.reason))
-    )
+    stored = await target.cached(partial(ParamCache.store_snapshot, reason=body.reason))
+    return json_output.snapshot_json(stored)
 
 
 @reading.get(f"{VEHICLE}/history")

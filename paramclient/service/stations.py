@@ -37,6 +37,13 @@ STATION_TIMEOUT: Final = 60.0
 """Seconds of silence after which a station on UDP is forgotten."""
 STATIONS_MAX: Final = 64
 """Stations of one endpoint, at most; the one that was silent for longest is forgotten first."""
+REQUESTS_MAX: Final = 200
+"""Requests of one station that wait for a vehicle or a fetch, at most; further ones are dropped, as on a full
+link."""
+READS_AT_ONCE: Final = 3
+"""Reads of one station that vehicles are asked for at once: fewer than of all, so that others have a turn."""
+SETS_AT_ONCE: Final = 20
+"""Sets likewise: bursts of 20 to a PX4 were all acknowledged (measured)."""
 SOURCES_MAX: Final = 64
 """Senders that are named of one station, at most."""
 ENDPOINT_BACKOFF: Final = 1.0
@@ -98,7 +105,10 @@ class GroundStation:
         sources: the system and component ids under which it sends.
         version: of MAVLink, of the answers: 1 only for a station that has sent version 1 and never 2.
         requests: of parameters, by kind.
-        list_passed_at: when its last request for a list was passed to a vehicle.
+        list_asked_at: when it last asked for a list of which no table was known.
+        waiting: requests that wait.
+        files: that it has open over MAVFTP, by session.
+        reading, writing: limit its reads and sets in progress, so that no station holds others up.
         relayed, answered, dropped: frames.
         saved: bytes of answers that did not have to come over the vehicle's link.
     """
@@ -111,9 +121,12 @@ class GroundStation:
         self.sources: set[Source] = set()
         self.version = 2
         self.requests: Counter[str] = Counter()
-        self.list_passed_at = -math.inf
+        self.list_asked_at = -math.inf
+        self.waiting = 0
+        self.files: dict[tuple[Hashable, ...], Any] = {}
+        self.reading = anyio.CapacityLimiter(READS_AT_ONCE)
+        self.writing = anyio.CapacityLimiter(SETS_AT_ONCE)
         self.relayed = self.answered = self.dropped = self.saved = 0
-        self._versions: set[int] = set()
         self._numbering: defaultdict[Source, Numbering] = defaultdict(Numbering)
         self._queue: deque[tuple[Source, bytes | Message | None, bool]] = deque()  # None: withheld
         self._streams: dict[Hashable, tuple[Source, Iterator[Message]]] = {}
@@ -154,10 +167,9 @@ class GroundStation:
     def received(self, seen: SeenFrame) -> None:
         """Take note of a frame of the station."""
         self.received_at = anyio.current_time()
+        self.version = max(seen.frame.version, self.version if self.sources else 1)
         if len(self.sources) < SOURCES_MAX:
             self.sources.add((seen.frame.system, seen.frame.component))
-        self._versions.add(seen.frame.version)
-        self.version = max(self._versions)
 
     def relay(self, seen: SeenFrame) -> None:
         """Queue a frame of a vehicle."""

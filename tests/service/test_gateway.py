@@ -156,16 +156,23 @@ async def test_rule_1_a_list_at_the_first_heartbeat_stays_off_the_radio() -> Non
         assert askers(vehicle) == {254}
 
 
-async def test_rule_1_a_list_that_was_passed_before_the_vehicle_was_heard_is_answered() -> None:
-    """A station may ask before the first heartbeat; the values are then answers to the gateway too."""
-    vehicle = ArduPilotVehicle(ftp=False)
-    async with gateway_over(Air.symmetric([vehicle], delay=0.02, rate=5_760)) as served:
+@pytest.mark.parametrize("system", [0, 1])
+async def test_rule_1_a_list_that_was_asked_before_the_vehicle_was_heard_is_answered(system: int) -> None:
+    """It passes to a vehicle that may be there; the values are then answers to the gateway too."""
+    vehicle = Tap(Air.symmetric([ArduPilotVehicle(ftp=system == 0)], delay=0.02, rate=5_760))
+    async with gateway_over(vehicle) as served:
         station = served.partner()
-        station.send(GCS, LIST)
+        opening = Packet(1, 5, Opcode.OPEN_FILE_RO, b"@PARAM/param.pck")
+        station.send(GCS, ParamRequestList(system, 1), FileTransfer(0, system, 1, opening.pack()))
         await until(lambda: served.clients[0].components)
         await served.synced()
         await anyio.sleep(2.0)
         assert {each.param_index for each in station.of(ParamValue)} >= set(range(1382))
+        assert {
+            frame.system
+            for _, frame, message in vehicle.received
+            if isinstance(message, (*REQUESTS, FileTransfer))
+        } == ({254, 255} if system else {254})
 
 
 async def test_rule_1_a_key_is_never_passed_on() -> None:
@@ -348,11 +355,29 @@ async def test_rule_2_other_files_pass_and_an_upload_has_the_table_proven() -> N
         [answer] = await station.ask_file(Opcode.OPEN_FILE_RO, data=b"nothing.txt")
         assert answer.opcode == Opcode.NAK
         assert vehicle.messages(FileTransfer)
-        await station.ask_file(Opcode.CREATE_FILE, data=b"@PARAM/param.pck", sequence=5)
+        vehicle.received.clear()
+        await station.ask_file(Opcode.OPEN_FILE_RO, data=b"@PARAM/param.pck", sequence=3)
+        await station.ask_file(Opcode.CREATE_FILE, data=b"@PARAM/param.pck", sequence=5)  # in this session
         await station.ask_file(Opcode.TERMINATE_SESSION, sequence=7, seconds=0.1)
+        passed = [Packet.unpack(each.payload).opcode for each in vehicle.messages(FileTransfer)]
+        assert passed[:2] == [Opcode.CREATE_FILE, Opcode.TERMINATE_SESSION]
         assert component.sync_state == "checking"
         await anyio.sleep(10.0)
         assert component.sync_state == "synced"
+
+
+@pytest.mark.parametrize("opcode", [Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS])
+async def test_rule_2_a_station_does_not_close_the_session_of_the_fetch(opcode: Opcode) -> None:
+    """An ArduPilot has one, and the list takes 20 s over a radio."""
+    vehicle = Tap(Air.symmetric([ArduPilotVehicle()], loss=0.05, delay=0.02, rate=5_760, seed=1))
+    async with gateway_over(vehicle) as served:
+        component = await served.clients[0].component()
+        station = served.partner()
+        station.send(LIST)
+        await anyio.sleep(0.1)
+        while component.sync_state != "synced":
+            assert (await station.ask_file(opcode, seconds=0.1))[-1].opcode == Opcode.ACK
+        assert not vehicle.messages(ParamRequestList)
 
 
 # 3: never older than known
@@ -1026,18 +1051,38 @@ async def test_a_switch_of_a_group_during_a_list() -> None:
 
 
 async def test_a_station_that_floods_and_one_that_sends_garbage() -> None:
-    async with in_sync(PX4Vehicle()) as (served, vehicle, station):
+    """Another station is answered as without them, and what waits for the vehicle does not grow."""
+    async with in_sync(Air.symmetric([PX4Vehicle()], delay=0.05)) as (served, vehicle, station):
         flood, garbage = served.partner(system=7), served.partner(system=8)
-        noise = random.Random(1)
+        noise, tasks = random.Random(1), len(anyio.get_running_tasks())
         for number in range(100):
             flood.send(*[LIST] * 30, *[ParamRequestRead(1, 1, f"N{number}", -1)] * 20)
             flood.send(*(ParamRequestRead(1, 1, "", index) for index in range(900, 950)))
+            flood.send(*(set_to("MC_PITCH_P", number + each / 64, ParamType.REAL32) for each in range(60)))
             garbage.send_bytes(noise.randbytes(500))
             await anyio.sleep(0.01)
-        await station.ask(LIST)
+        assert len(anyio.get_running_tasks()) <= tasks + stations.REQUESTS_MAX + 20
+        asked = set_to("MC_ROLL_P", 3, ParamType.REAL32), ParamRequestRead(1, 1, "UNKNOWN", -1)
+        await station.ask(LIST, *asked, seconds=1.5)
         assert len(station.of(ParamValue)) >= 904
+        assert by_name(station)["MC_ROLL_P"] == struct.pack("<f", 3)
+        assert [each.param_id for each in station.of(ParamError)] == ["UNKNOWN"]
         assert len(requested(vehicle)) < 200
         assert station.of(Heartbeat)
+
+
+async def test_a_station_that_floods_openings_of_the_file_while_the_table_loads() -> None:
+    async with gateway_over(ArduPilotVehicle(ftp_rate=2_000.0)) as served:
+        await served.clients[0].component()
+        flood, station = served.partner(), served.partner()
+        tasks = len(anyio.get_running_tasks())
+        for number in range(3_000):
+            packet = Packet(number, 0, Opcode.OPEN_FILE_RO, b"@PARAM/param.pck")
+            flood.send(FileTransfer(0, 1, 1, packet.pack()))
+        await anyio.sleep(1.0)
+        assert len(anyio.get_running_tasks()) <= tasks + stations.REQUESTS_MAX + 20
+        [answer] = await station.ask_file(Opcode.OPEN_FILE_RO, data=b"@PARAM/param.pck", seconds=2.9)
+        assert (answer.opcode, answer.code) == (Opcode.NAK, 10)
 
 
 @pytest.mark.asyncio
