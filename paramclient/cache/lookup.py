@@ -87,7 +87,7 @@ def find_vehicle(
     if fits:
         raise AmbiguousVehicle(
             f"{wanted or 'no name'} fits {len(fits)} vehicles in the cache {place}:{_listed(fits)}\n"
-            "Choose one by its key.",
+            f"Choose one by its key, as {fits[0].key}.",
             vehicles=tuple(map(str, fits)),
         )
     reason = "" if problem is None else f": {problem}"

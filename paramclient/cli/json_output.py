@@ -181,6 +181,7 @@ def fetch_json(
         **taken(component.core.link_task, "bytes_received", "bytes_sent"),
         "params": {
             each.name: param_json(each, None if metadata is None else metadata.find(each.name))
+            | {"trust": each.trust}
             for each in params
         },
     }

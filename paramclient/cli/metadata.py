@@ -45,24 +45,18 @@ METADATA_HINT: Final = (
 _DEFAULTS: Final = CacheOptions()
 
 
-def _choice(_: object, tokens: Sequence[Token]) -> Metadata | str:
-    """Return the metadata of the file that --metadata names, or `VEHICLE`.
-
-    Raises:
-        UsageError: the file has no metadata.
-    """
-    return VEHICLE if tokens[0].value == VEHICLE else read_metadata(tokens[0].value)
-
-
 def _file(_: object, tokens: Sequence[Token]) -> Metadata:
     """Return the metadata of the file that --metadata names.
 
     Raises:
-        UsageError: the file has no metadata, or a vehicle is meant.
+        UsageError: the file has no metadata.
     """
-    if tokens[0].value == VEHICLE:
-        raise UsageError("it takes a file here; that of a vehicle is stored by `paramclient fetch`")
     return read_metadata(tokens[0].value)
+
+
+def _choice(_: object, tokens: Sequence[Token]) -> Metadata | str:
+    """Return `VEHICLE`, or the metadata as `_file` does."""
+    return VEHICLE if tokens[0].value == VEHICLE else _file(_, tokens)
 
 
 _NAME: Final = Parameter(name="--metadata", n_tokens=1, accepts_keys=False)
@@ -197,19 +191,15 @@ def metadata_add(
     """
     added, metadata = _files(options).add(file, vehicle, firmware)
     words = f"{counted(len(metadata), 'description')} from {file} for {added}"
-    print_result(_added_json(added, len(metadata)), words, json=options.json)
+    print_result(_added_json(added, metadata), words, json=options.json)
 
 
 def metadata_list(*, options: CacheOptions = _DEFAULTS) -> None:
     """Print the metadata files that were added."""
-    counts = [(each, len(read_metadata(each.path))) for each in _files(options)]
-    show(
-        {"metadata": [_added_json(*each) for each in counts]},
-        ["vehicle", "firmware", "descriptions"],
-        ((each.kind, each.firmware or "any", count) for each, count in counts),
-        json=options.json,
-        empty="no metadata was added",
-    )
+    found = [_added_json(each, read_metadata(each.path)) for each in _files(options)]
+    rows = ((each["vehicle"], each["firmware"] or "any", each["descriptions"]) for each in found)
+    columns = ("vehicle", "firmware", "descriptions")
+    show({"metadata": found}, columns, rows, json=options.json, empty="no metadata was added")
 
 
 def metadata_remove(
@@ -226,9 +216,8 @@ def metadata_remove(
     print_result(found, f"the metadata for {removed} was removed", json=options.json)
 
 
-def _added_json(added: AddedMetadata, count: int) -> JsonObject:
-    """Return the JSON of an added file with this number of descriptions."""
-    return {"vehicle": added.kind, "firmware": added.firmware, "descriptions": count}
+def _added_json(added: AddedMetadata, metadata: Metadata) -> JsonObject:
+    return {"vehicle": added.kind, "firmware": added.firmware, "descriptions": len(metadata)}
 
 
 def _files(options: CacheOptions) -> AddedFiles:

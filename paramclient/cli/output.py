@@ -25,7 +25,6 @@ from paramclient import errors
 from paramclient.errors import ParamClientError
 from paramclient.model.names import first_of
 from paramclient.model.values import Param
-from paramclient.protocol.fetch import Progress
 
 STDIN: Final = "stdin:"
 """What `-` among the arguments becomes, which cyclopts would take for an option: the standard input."""
@@ -71,10 +70,7 @@ def printable(text: str) -> str:
     text = text.replace("…", "...")  # of the library's messages
     if text.isascii() and text.isprintable():
         return text
-    return "".join(
-        each if each.isascii() and each.isprintable() else each.encode("unicode_escape").decode()
-        for each in text
-    )
+    return "".join(each if " " <= each <= "~" else each.encode("unicode_escape").decode() for each in text)
 
 
 def milliseconds(seconds: float) -> str:
@@ -182,8 +178,9 @@ def print_result(item: object, words: str, *, json: bool) -> None:
 
 
 def cells_of(objects: Mapping[str, Mapping[str, object]], *members: str) -> Iterator[list[object]]:
-    """Yield the row of each object of JSON: its name, and these members."""
-    return ([name, *map(each.get, members)] for name, each in objects.items())
+    """Yield the row of each object of JSON: its name, and these members; the meaning is the member text."""
+    keys = ["text" if member == "meaning" else member for member in members]
+    return ([name, *map(each.get, keys)] for name, each in objects.items())
 
 
 def clear_screen() -> None:
@@ -215,10 +212,9 @@ def _table_lines(
 
 
 def _styled(text: str, style: str) -> str:
-    codes = [_STYLES[each] for each in style.split()]
-    if "NO_COLOR" in os.environ:
-        codes = [each for each in codes if len(each) == 1]
-    return f"\x1b[{';'.join(codes)}m{text}\x1b[0m" if codes and text else text
+    if not (style and text) or "NO_COLOR" in os.environ:
+        return text
+    return f"\x1b[{';'.join(_STYLES[each] for each in style.split())}m{text}\x1b[0m"
 
 
 # Questions
@@ -275,8 +271,8 @@ class Status:
 
     def __init__(self, awaited: str, title: str = "", heard: Callable[[], str] = lambda: "") -> None:
         self._awaited, self._title, self._heard = awaited, title, heard
-        self._progress: Progress | None = None
-        self._counts_since: float | None = None
+        self._progress = ""
+        self._first: tuple[float, int] | None = None
 
     def __enter__(self) -> Self:
         if sys.stderr.isatty():
@@ -292,19 +288,20 @@ class Status:
             self._active.remove(self)
             self.erase()
 
-    def update(self, progress: Progress) -> None:
-        """Show a progress, as that of a fetch."""
-        if progress.received and self in self._active:
-            self._progress = progress
-            if self._loop.time() - (Status._drawn_at or 0.0) >= DRAW_INTERVAL:
-                self._draw()
-
     def count(self, received: int, total: int | None) -> None:
-        """Show a progress by its count, with the rate since the first one."""
-        if self in self._active:
-            now = self._loop.time()
-            self._counts_since = self._counts_since or now
-            self.update(Progress.after(received, total, now - self._counts_since))
+        """Show a progress, and after `DRAW_INTERVAL` the rate since the first one."""
+        if not received or self not in self._active:
+            return
+        now = self._loop.time()
+        began, before = self._first = self._first or (now, received)
+        self._progress = f"{self._title} {received}/{total or '?'}"
+        if (elapsed := now - began) >= DRAW_INTERVAL:
+            rate = (received - before) / elapsed
+            self._progress += f" {rate:.0f}/s"
+            if rate and total:
+                self._progress += f", {(total - received) / rate:.0f} s left"
+        if now - (Status._drawn_at or 0.0) >= DRAW_INTERVAL:
+            self._draw()
 
     @classmethod
     def erase(cls) -> None:
@@ -319,19 +316,15 @@ class Status:
         self._draw()
 
     def _draw(self) -> None:
-        line = printable("; ".join(each._text() for each in self._active))
+        line = printable("; ".join(each._text for each in self._active))
         sys.stderr.write(f"{ERASE}{line[: shutil.get_terminal_size().columns - 1]}")
         sys.stderr.flush()
         Status._drawn_at = self._loop.time()
 
+    @property
     def _text(self) -> str:
-        state = self._progress
-        if state is None:
-            waited = int(self._loop.time() - self._began)
-            return f"{self._awaited} ({waited} s). {self._heard()}".rstrip()
-        left = "" if state.seconds_left is None else f", {state.seconds_left:.0f} s left"
-        total = "?" if state.total is None else state.total
-        return f"{self._title} {state.received}/{total} {state.rate:.0f}/s{left}"
+        waited = int(self._loop.time() - self._began)
+        return self._progress or f"{self._awaited} ({waited} s). {self._heard()}".rstrip()
 
 
 # Errors

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar, Final
+from typing import Final
 
 import anyio
 
-from paramclient.cli.json_output import JsonObject, fetch_json, param_json, param_value
+from paramclient.cli.json_output import JsonObject, fetch_json, param_json, param_value, taken
 from paramclient.cli.metadata import (
     MetadataChoice,
     default_in,
@@ -21,10 +21,10 @@ from paramclient.cli.metadata import (
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
-    LINE_NAMES_MAX,
     ExitCode,
     by_index,
     cells_of,
+    listed,
     local_time,
     milliseconds,
     print_json,
@@ -37,11 +37,10 @@ from paramclient.cli.session import CommandSession, Sessions, check_given, get_c
 from paramclient.client.client import Event
 from paramclient.errors import ParamClientError, VehicleError
 from paramclient.links import ReplayLink
-from paramclient.metadata import Metadata
-from paramclient.model.names import NameChoice, counted, first_of
+from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import hash_text, rounded, time_text
 from paramclient.model.paramset import Default
-from paramclient.model.values import Param, format_value
+from paramclient.model.values import Param
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.table import Change
@@ -70,22 +69,22 @@ async def fetch(
     chosen = NameChoice(check_given(names) or ["*"])
     async with sessions(url, options) as found:
 
-        async def work(session: CommandSession) -> _Fetched:
+        async def work(session: CommandSession) -> _Shown:
             result = await session.fetch(refresh=refresh)
             params = by_index(each for name, each in result.params.items() if name not in result.cached)
             known = None
             if changed or options.json or metadata is not None:
                 known = await known_of_session(session, metadata)
-            defaults = {param.name: default_in(known, param) for param in params}
+            defaults = {param.name: default_in(known, param) for param in params} if changed else {}
             if changed and not any(defaults.values()):
                 raise VehicleError(no_defaults(), *session.component.address)
-            kept = chosen.choose(defaults) if names else defaults.keys()
-            params = [
-                param
-                for param in params
-                if param.name in kept and (not changed or _is_changed(param, defaults[param.name]))
-            ]
-            return _Fetched(session, result, params, known, defaults if changed else {})
+            kept = chosen.choose({param.name for param in params}) if names else {*result.params}
+            if changed:
+                kept &= {param.name for param in params if _is_changed(param, defaults[param.name])}
+            params = [param for param in params if param.name in kept]
+            columns = ("name", "value", "type", "index", "trust", *(["default"] if changed else []))
+            item = fetch_json(session.component, result, params, known)
+            return _Shown(item, columns, partial(_report_fetch, session, result, [*map(defaults.get, kept)]))
 
         done = await found.work(work)
     return found.show(done)
@@ -111,9 +110,18 @@ async def get(
     chosen = check_given((name, *names))
     async with sessions(url, options) as found:
 
-        async def work(session: CommandSession) -> _Read:
+        async def work(session: CommandSession) -> _Shown:
             params, errors = await get_chosen(session, chosen)
-            return _Read(session, params, errors, await known_of_session(session, metadata))
+            known = await known_of_session(session, metadata)
+            item: JsonObject = {
+                "params": {
+                    each.name: param_json(each, info_of(known, each.name), whole=True) for each in params
+                }
+            }
+            if errors:
+                item["errors"] = {name: str(error) for name, error in errors.items()}
+            columns = ("name", "value", "type", "index", "meaning", "units")
+            return _Shown(item, columns, partial(_report_get, session, errors.values()))
 
         done = await found.work(work)
     return found.show(done)
@@ -123,101 +131,50 @@ def _is_changed(param: Param, default: Default | None) -> bool:
     return default is not None and replace(param, default=default.value).is_changed is True
 
 
-@dataclass(slots=True)
-class _Fetched:
-    """The parameters that were received or confirmed in this session: values that are only cached are not.
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """The JSON of a vehicle's parameters, and the function that prints remarks and returns the exit code."""
 
-    Attributes:
-        session: the vehicle.
-        result: the fetch.
-        params: the parameters.
-        metadata: the metadata of the vehicle for its defaults, or None.
-        defaults: the defaults of the parameters by name, if the table is to show them.
-    """
+    json: JsonObject
+    columns: Sequence[str]
+    report: Callable[[], int]
 
-    columns: ClassVar[Sequence[str]] = ("name", "value", "type", "index", "trust", "default")
+    def as_json(self) -> JsonObject:
+        """Return the JSON."""
+        return self.json
 
-    session: CommandSession
-    result: FetchResult
-    params: list[Param]
-    metadata: Metadata | None
-    defaults: Mapping[str, Default | None]
+    def rows(self) -> Iterator[Sequence[object]]:
+        """Yield the cells of each parameter."""
+        return cells_of(self.json["params"], *self.columns[1:])
 
-    def report(self) -> int:
-        """Print notes, a summary, and what is missing; return the exit code."""
-        session, result = self.session, self.result
-        for note in result.notes:
-            report(f"{session.prefix}{note}")
-        if not session.options.json:
-            if self.defaults:
-                say_sources(session.label, (self.defaults[param.name] for param in self.params))
-            say(self._summary)
-        if not result.missing:
-            return ExitCode.DONE
-        missing = counted(len(result.missing), "parameter")
-        report(
-            f"incomplete: {session.label} did not send {missing}, index "
-            f"{first_of(result.missing, LINE_NAMES_MAX)}; run the command again to request them"
-        )
-        return ExitCode.INCOMPLETE
 
-    @property
-    def _summary(self) -> str:
-        """The line about the fetch: parameters, source, seconds, losses, bytes, hash."""
-        result, client = self.result, self.session.client
+def _report_fetch(session: CommandSession, result: FetchResult, defaults: Sequence[Default | None]) -> int:
+    """Print notes, a summary, and what is missing; return the exit code."""
+    client, label = session.client, session.label
+    for note in result.notes:
+        report(f"{session.prefix}{note}")
+    if not session.options.json:
+        say_sources(label, defaults)
         of = f" of {result.count}" if result.missing else ""
         crc = "" if result.hash is None else f"; hash {hash_text(result.hash)}"
         lost = "" if result.source == "cache" else f"{result.lost} lost, {result.repeated} repeated, "
         trip = "" if result.round_trip is None else f"round trip {milliseconds(result.round_trip)}, "
         link = " on the whole link" if len(client.components) > 1 else ""
-        return (
-            f"{result.received}{of} {self.session.noun}s of {self.session.label} from "
-            f"{result.source} in {result.elapsed:.2f} s, {lost}{trip}{client.bytes_received:,} "
-            f"bytes received, {client.bytes_sent:,} sent{link}{crc}"
-        )
-
-    def as_json(self) -> JsonObject:
-        """Return the JSON object."""
-        return fetch_json(self.session.component, self.result, self.params, self.metadata)
-
-    def rows(self) -> Iterator[Sequence[object]]:
-        """Yield the cells of each parameter."""
-        for param in self.params:
-            default = self.defaults.get(param.name)
-            value, kind = format_value(param.settable, param.type), param.type.name
-            changed = default and format_value(default.value, param.type)
-            yield param.name, value, kind, param.index, param.trust, changed
+        fetched = f"{result.received}{of} {session.noun}s of {label} from {result.source}"
+        traffic = f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent{link}"
+        say(f"{fetched} in {result.elapsed:.2f} s, {lost}{trip}{traffic}{crc}")
+    if not result.missing:
+        return ExitCode.DONE
+    missing = f"{counted(len(result.missing), 'parameter')}, index {listed(result.missing)}"
+    report(f"incomplete: {label} did not send {missing}; run the command again to request them")
+    return ExitCode.INCOMPLETE
 
 
-@dataclass(frozen=True, slots=True)
-class _Read:
-    """The parameters that were read from a vehicle, the errors by name, and the metadata or None."""
-
-    columns: ClassVar[Sequence[str]] = ("name", "value", "type", "index", "meaning", "units")
-
-    session: CommandSession
-    params: list[Param]
-    errors: Mapping[str, ParamClientError]
-    metadata: Metadata | None
-
-    def as_json(self) -> JsonObject:
-        """Return the JSON of the parameters with all their metadata, and of the errors."""
-        failed = {name: str(error) for name, error in self.errors.items()}
-        found = {
-            each.name: param_json(each, info_of(self.metadata, each.name), whole=True) for each in self.params
-        }
-        return {"params": found} | ({"errors": failed} if failed else {})
-
-    def report(self) -> int:
-        """Print a doubt about the values, and the errors; return the exit code."""
-        prefix = self.session.prefix
-        if doubt := self.session.component.session.encoding_doubt:
-            report(f"{prefix}{doubt}")
-        return report_all(self.errors.values(), prefix)
-
-    def rows(self) -> Iterator[Sequence[object]]:
-        """Yield the cells of each parameter, with meaning and units if metadata is known."""
-        return cells_of(self.as_json()["params"], "value", "type", "index", "text", "units")
+def _report_get(session: CommandSession, errors: Iterable[ParamClientError]) -> int:
+    """Print a doubt about the values, and the errors; return the exit code."""
+    if doubt := session.component.session.encoding_doubt:
+        report(f"{session.prefix}{doubt}")
+    return report_all(errors, session.prefix)
 
 
 # watch
@@ -286,24 +243,19 @@ def _print(session: CommandSession, item: JsonObject, text: str) -> None:
 
 def _change(change: Change) -> tuple[JsonObject, str]:
     """Return a change as JSON and in words."""
-    old, new = param_value(change.old), param_value(change.new)
-    words = f"{'none' if old is None else old} -> {'none' if new is None else new}"
-    if change.kind == "added":
-        words = f"added: {new}"
-    elif change.kind == "removed":
-        words = f"removed, was {old}"
-    found = {"name": change.name, "old": old, "new": new, "by": change.by, "kind": change.kind}
-    return found, f"{change.name}  {words}  ({change.by})"
+    found = {"name": change.name, "old": param_value(change.old), "new": param_value(change.new)}
+    old, new = ("none" if found[side] is None else found[side] for side in ("old", "new"))
+    return found | taken(change, "by", "kind"), f"{change.name}  {old} -> {new}  ({change.by})"
 
 
 def _event(event: Event) -> tuple[JsonObject, str]:
     """Return an event as JSON and in words."""
-    component, words = event.component, ""
-    found: JsonObject = {"event": event.kind, "system": component.system, "component": component.component}
+    found = {"event": event.kind, **taken(event.component, "system", "component")}
+    words = f"{found['system']}/{found['component']} {event.kind}"
     if event.silence is not None:
         found["silence_s"] = rounded(event.silence)
-        words = f" after {event.silence:.1f} s without a message"
+        words += f" after {event.silence:.1f} s without a message"
     if event.kind == "resynced":
         found |= {"changed": event.changed, "hash": hash_text(event.hash)}
-        words = f": {counted(len(event.changed), 'value')} had changed"
-    return found, f"{component.system}/{component.component} {event.kind}{words}"
+        words += f": {counted(len(event.changed), 'value')} had changed"
+    return found, words

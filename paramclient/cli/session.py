@@ -13,9 +13,9 @@ import anyio
 from paramclient.cli.json_output import JsonObject
 from paramclient.cli.options import LinkOptions, TrafficOptions
 from paramclient.cli.output import (
-    LINE_NAMES_MAX,
     ExitCode,
     Status,
+    listed,
     print_json,
     print_table,
     report,
@@ -29,7 +29,7 @@ from paramclient.links import LinkKind
 from paramclient.model.identity import version_text
 from paramclient.model.names import NameChoice, first_of, is_pattern
 from paramclient.model.values import Param, Trust, check_name
-from paramclient.protocol.fetch import FetchResult
+from paramclient.protocol.fetch import FetchResult, Progress
 from paramclient.protocol.identity import HEARTBEAT_WAIT, expects_extended
 from paramclient.protocol.selection import address_in_words, hint_of_link, node_in_words
 
@@ -164,11 +164,14 @@ class CommandSession:
     async def fetch(self, *, refresh: bool = False) -> FetchResult:
         """Fetch the table; after an interruption, print what was received and kept."""
         component, title = self.component, f"fetching {self.label}"
+
+        def update(progress: Progress) -> None:
+            status.count(progress.received, progress.total)
+
         with Status(f"{title}: waiting for the first response", title) as status:
             try:
-                return await component.fetch_all(
-                    refresh=refresh, timeout=self.deadline.left(), progress=status.update
-                )
+                timeout = self.deadline.left()
+                return await component.fetch_all(refresh=refresh, timeout=timeout, progress=update)
             except anyio.get_cancelled_exc_class():
                 received = sum(each.trust is not Trust.CACHED for each in component.params.values())
                 of = "" if component.count is None else f" of {component.count}"
@@ -289,14 +292,9 @@ class Sessions(list[CommandSession]):
     @property
     def others(self) -> list[str]:
         """Other vehicles of the link in words, if --vehicle did not choose the one that is used."""
-        first = self[0]
-        if first.options.vehicle is not None:
-            return []
-        return [
-            node_in_words(each.node)
-            for each in first.client.autopilots
-            if each.node is not first.component.node
-        ]
+        client, own = self[0].client, self[0].component.node
+        heard = client.autopilots if self[0].options.vehicle is None else []
+        return [node_in_words(each.node) for each in heard if each.node is not own]
 
     def report_others(self) -> None:
         """Report other vehicles of the link, if --vehicle did not choose the one that was used.
@@ -306,7 +304,7 @@ class Sessions(list[CommandSession]):
         if self.others:
             report(
                 f"{self[0].label} was used, the first vehicle heard. Also on this link: "
-                f"{first_of(self.others, LINE_NAMES_MAX)}. --vehicle chooses one"
+                f"{listed(self.others)}. --vehicle chooses one"
             )
 
 
@@ -380,15 +378,13 @@ async def _with_parameters(components: Sequence[Component]) -> list[Component]:
     """Return the components that have a parameter, and print a line for each other."""
 
     async def ask(component: Component) -> None:
-        with suppress(UnknownParameter):
-            try:
-                await component.get(0, timeout=OTHERS_TIMEOUT)
-            except NoReply:
-                noun, hint = "parameters", "; --extended uses extended ones"
-                if component.is_extended:
-                    noun, hint = "extended parameters", ""
-                what = f"{node_in_words(component.node)} has no {noun}, or none within {OTHERS_TIMEOUT:g} s"
-                say(f"{what}{hint}")
+        with suppress(NoReply, UnknownParameter):
+            await component.get(0, timeout=OTHERS_TIMEOUT)
+        if component.count is None:
+            noun, hint = "parameters", "; --extended uses extended ones"
+            if component.is_extended:
+                noun, hint = "extended parameters", ""
+            say(f"{node_in_words(component.node)} has no {noun}, or none within {OTHERS_TIMEOUT:g} s{hint}")
 
     async with anyio.create_task_group() as tasks:
         for each in components:
@@ -439,16 +435,15 @@ async def _find_by_uid(client: ParamClient, uid: str, timeout: float | None) -> 
 
     began, awaited = anyio.current_time(), f"a vehicle with hardware id {uid}"
     with _waiting(client, awaited), anyio.move_on_after(timeout):
-        while not fitting():
+        while not (found := fitting()):
             await client.core.link_task.wait_for_activity()
-        if fitting()[0].identity.uid != uid:
+        if found[0].identity.uid != uid:
             await anyio.sleep(HEARTBEAT_WAIT)
-        found, *others = fitting()
-        if others:
-            words = [node_in_words(each.node) for each in fitting()]
-            what = f"{len(words)} vehicles on this link have hardware ids that begin with {uid}"
-            raise AmbiguousVehicle(f"{what}: {', '.join(words)}.", vehicles=words, choose_by="system")
-        return found
+        if len(found := fitting()) == 1:
+            return found[0]
+        words = [node_in_words(each.node) for each in found]
+        what = f"{len(words)} vehicles on this link have hardware ids that begin with {uid}"
+        raise AmbiguousVehicle(f"{what}: {', '.join(words)}.", vehicles=words, choose_by="system")
     waited = anyio.current_time() - began
     raise NoReply(awaited, attempts=0, waited=waited, hint=received_in_words(client))
 
@@ -483,8 +478,6 @@ async def get_chosen(
     component = session.component
     if not is_fetched and (is_fetched := any(map(is_pattern, given))):
         await session.fetch()
-    known = component.params if is_fetched else {}
-    fresh = {name: param for name, param in known.items() if param.trust is not Trust.CACHED}
     found: dict[str, Param | ParamClientError | None] = {}
     for text in given:
         names = [spelling(text, component)]
@@ -493,7 +486,9 @@ async def get_chosen(
         if not names:
             what = f"{session.address} has no parameter that matches {text}"
             found[text] = UnknownParameter(what, *component.address, name=text)
-        found |= {name: fresh.get(name) for name in names}
+        for name in names:
+            known = component.params.get(name) if is_fetched else None
+            found[name] = None if known is None or known.trust is Trust.CACHED else known
     requested = [name for name, each in found.items() if each is None]
 
     async def read(name: str) -> None:
@@ -514,15 +509,10 @@ def check_given(given: Iterable[str]) -> list[str]:
     """Return names and patterns without repetitions.
 
     Raises:
-        UsageError: a name is not a valid param_id, or a pattern has other than printable ASCII characters.
+        UsageError: a name is not a valid param_id.
     """
     chosen = list(dict.fromkeys(given))
-    for text in chosen:
-        if not is_pattern(text):
-            check_name(text)
-        elif not (text.isascii() and text.isprintable()):
-            raise UsageError(f"pattern {text!r}: only printable ASCII characters are allowed")
-    return chosen
+    return [text if is_pattern(text) else check_name(text) for text in chosen]
 
 
 def spelling(name: str, component: Component) -> str:
@@ -531,8 +521,5 @@ def spelling(name: str, component: Component) -> str:
     A name that fits several parameters in upper and lower case, and is none of them, is returned unchanged:
     the vehicle has no such parameter.
     """
-    if name in component.params:
-        return name
-    upper = name.upper()
-    known = [each for each in component.params if each.upper() == upper]
+    known = [each for each in component.params if each.upper() == name.upper()]
     return known[0] if len(known) == 1 else name

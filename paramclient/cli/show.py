@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Final
 
-from paramclient.cache import CachedComponent, CachedSummary, ParamCache
+from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.cached import load_tables, show_summaries
 from paramclient.cli.json_output import (
     JsonObject,
@@ -20,6 +19,7 @@ from paramclient.cli.metadata import (
     METADATA_HINT,
     MetadataFile,
     default_in,
+    defaults_in,
     info_of,
     known_of_sets,
     no_defaults,
@@ -37,7 +37,7 @@ from paramclient.cli.output import (
     say,
 )
 from paramclient.cli.session import check_given
-from paramclient.cli.sources import check_link, described
+from paramclient.cli.sources import check_link, described, part_of
 from paramclient.errors import UsageError
 from paramclient.files.formats import address
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo
@@ -90,12 +90,10 @@ async def show(
     everything = {name for each in sets for name in each}
     kept = NameChoice(chosen).choose(everything) if chosen else everything
     views = []
-    for params, info in zip(sets, known_of_sets(sets, options, metadata), strict=True):
-        part = {name: param for name, param in params.items() if name in kept}
-        found_defaults = {name: default_in(info, param) for name, param in part.items()}
-        defaults = {name: default for name, default in found_defaults.items() if default is not None}
-        values = {name: default.value for name, default in defaults.items()}
-        shown = add_defaults(replace(params, params=part), values)
+    for whole, info in zip(sets, known_of_sets(sets, options, metadata), strict=True):
+        part = part_of(whole, kept)
+        shown = add_defaults(part, defaults_in(info, part))
+        defaults = {name: default for name, each in part.items() if (default := default_in(info, each))}
         views.append((non_defaults(shown) if changed else shown, info, defaults))
     if changed and not any(defaults for _, _, defaults in views):
         report(no_defaults())
@@ -106,11 +104,9 @@ async def show(
         return ExitCode.DONE
     for (shown, info, defaults), item in zip(views, items, strict=True):
         columns = ("name", "value", "default", "type", "meaning", "units", "comment")
-        members = ("value", "default", "type", "text", "units", "comment")
-        print_table(columns, cells_of(item["params"], *members))
-        if chosen and info is not None:
-            for name in shown:
-                _print_description(name, info.find(name))
+        print_table(columns, cells_of(item["params"], *columns[1:]))
+        for name in shown if chosen and info is not None else ():
+            _print_description(name, info_of(info, name))
         say(described(shown) + (", those that differ from their default" if changed else ""))
         if changed:
             say_sources(address(shown), [defaults[name] for name in shown])
@@ -155,16 +151,24 @@ def search(
         raise UsageError("search takes one or more words")
     known = _Cached(options, vehicle, metadata)
     ranks = {name: _rank(name, known.info(name), lowered_words) for name in known.names}
-    names = [name for _, name in sorted((rank, name) for name, rank in ranks.items() if rank is not None)]
+    found, rows = [], []
+    for _, name in sorted((rank, name) for name, rank in ranks.items() if rank is not None):
+        tables, info = known.having(name), known.info(name)
+        description = (info and info.short_description) or None
+        found.append({"name": name, "description": description, "vehicles": [each.key for each in tables]})
+        values = {format_value(each.params[name].settable, each.params[name].type) for each in tables}
+        value = f"{len(values)} values" if len(values) > 1 else next(iter(values), None)
+        where = ", ".join(f"{each.system}/{each.component}" for each in tables)
+        rows.append((name, value, where, description))
     if options.json:
-        print_json({"results": [known.result_json(name) for name in names]})
-    elif names:
-        print_table(["name", "value", "vehicle", "description"], map(known.cells, names))
-    if not names:
+        print_json({"results": found})
+    elif found:
+        print_table(["name", "value", "vehicle", "description"], rows)
+    if not found:
         report(f"nothing found; {counted(len(known.names), 'parameter')} searched")
     if known.undescribed and not options.json:
         say(f"only names of {known.undescribed} were searched: {METADATA_HINT}")
-    return ExitCode.DONE if names else ExitCode.INCOMPLETE
+    return ExitCode.DONE if found else ExitCode.INCOMPLETE
 
 
 def info(
@@ -187,34 +191,21 @@ def info(
     info = known.info(spelled)  # also that of a group, FOO{n}_BAR, which is not among the names
     if info is None:
         NameChoice([name]).choose(known.names, " of the cache")
-    tables = known.having(spelled)
-    vehicles = [
-        {
-            **taken(table, "key", "system", "component"),
-            "autopilot": autopilot_name(table.autopilot),
-            "heard_at": time_text(table.heard_at[spelled]),
-            "param": table_param_json(table.params[spelled], info),
-        }
-        for table in tables
-    ]
+    vehicles, rows = [], []
+    for table in known.having(spelled):
+        param, heard = table_param_json(table.params[spelled], info), table.heard_at[spelled]
+        autopilot, where = autopilot_name(table.autopilot), taken(table, "key", "system", "component")
+        vehicles.append(where | {"autopilot": autopilot, "heard_at": time_text(heard), "param": param})
+        cells = map(param.get, ("value", "text", "type", "default", "default_source"))
+        rows.append((f"{table.system}/{table.component}", *cells, local_time(heard), table.key))
     if options.json:
         print_json({"name": spelled, "metadata": info and info_json(info), "vehicles": vehicles})
         return ExitCode.DONE
     _print_description(spelled, info)
     if info is None and known.undescribed:
         say(f"no metadata of {known.undescribed} is known: {METADATA_HINT}")
-    if vehicles:
+    if rows:
         print_line("")
-        members = ("value", "text", "type", "default", "default_source")
-        rows = (
-            (
-                f"{table.system}/{table.component}",
-                *map(each["param"].get, members),
-                local_time(table.heard_at[spelled]),
-                table.key,
-            )
-            for table, each in zip(tables, vehicles, strict=True)
-        )
         print_table(("vehicle", "value", "meaning", "type", "default", "source", "heard", "key"), rows)
     return ExitCode.DONE
 
@@ -230,10 +221,10 @@ class _Cached:
     def __init__(self, options: CacheOptions, vehicle: str | None, given: Metadata | None) -> None:
         with ParamCache(options.cache) as cache:
             summaries = cache.components() if vehicle is None else tables_in(cache, vehicle)
-            tables = load_tables(cache, sorted(summaries, key=_address))
+            summaries = sorted(summaries, key=lambda each: (each.system, each.component))
+            self._tables = tables = load_tables(cache, summaries)
             store = MetadataStore.beside(cache.path)
         found = [given or store.known(table.identity, table.component) for table in tables]
-        self._tables = tables
         self._metadata = [*{id(each): each for each in (given, *found) if each is not None}.values()]
         self.names = {name for table in tables for name in table.params}
         if given is not None:
@@ -252,23 +243,6 @@ class _Cached:
         """Return the tables with this parameter."""
         return [table for table in self._tables if name in table.params]
 
-    def result_json(self, name: str) -> JsonObject:
-        """Return the JSON of a found parameter; `vehicles` are the keys of the vehicles that have it."""
-        info, keys = self.info(name), [each.key for each in self.having(name)]
-        return {"name": name, "description": (info and info.short_description) or None, "vehicles": keys}
-
-    def cells(self, name: str) -> Sequence[object]:
-        """Return the row of a found parameter, with its value if that is the same on all vehicles."""
-        tables, info = self.having(name), self.info(name)
-        values = {_value(table, name) for table in tables}
-        value = f"{len(values)} values" if len(values) > 1 else next(iter(values), None)
-        where = ", ".join(f"{each.system}/{each.component}" for each in tables)
-        return name, value, where, info and info.short_description
-
-
-def _address(table: CachedComponent | CachedSummary) -> tuple[int, int]:
-    return table.system, table.component
-
 
 def _rank(name: str, info: ParamInfo | None, lowered_words: Sequence[str]) -> int | None:
     """Return 0 if all words are in the name, 1 with the short description, 2 elsewhere; None if not."""
@@ -283,41 +257,26 @@ def _rank(name: str, info: ParamInfo | None, lowered_words: Sequence[str]) -> in
     return None
 
 
-def _value(table: CachedComponent, name: str) -> str:
-    param = table.params[name]
-    return format_value(param.settable, param.type)
-
-
 def _print_description(name: str, info: ParamInfo | None) -> None:
     """Print the whole metadata of a parameter as text."""
-    print_line("")
-    if info is None:
-        print_line(f"{name} is not described.")
-        return
-    print_line(f"{name}: {info.short_description}".removesuffix(": "))
-    for line in info.long_description.splitlines():
-        print_line(f"  {line}" if line.strip() else "")
-    for label, text in _fields(info):
-        print_line(f"  {label}: {text}")
+    lines = [f"\n{name} is not described."]
+    if info is not None:
+        texts = (f"  {line}" if line.strip() else "" for line in info.long_description.splitlines())
+        lines = [f"\n{name}: {info.short_description}".removesuffix(": "), *texts]
+        lines += [f"  {fact}" for fact in _facts(info)]
+    print_line("\n".join(lines))
 
 
-def _fields(info: ParamInfo) -> Iterator[tuple[str, str]]:
-    units = f" {info.units}" if info.units else ""
-    if info.minimum is not None or info.maximum is not None:
-        low, high = ("..." if each is None else format_value(each) for each in (info.minimum, info.maximum))
-        yield "range", f"{low} to {high}{units}"
+def _facts(info: ParamInfo) -> Iterator[str]:
+    found, units = info_json(info), f" {info.units}" if info.units else ""
+    if not found.keys().isdisjoint(("minimum", "maximum")):
+        yield f"range: {found.get('minimum', '...')} to {found.get('maximum', '...')}{units}"
     elif units:
-        yield "units", info.units
-    if info.increment is not None:
-        yield "step", f"{format_value(info.increment)}{units}"
-    if info.default is not None:
-        text = info.text(info.default)
-        yield "default", format_value(info.default) + (f" ({text})" if text else units)
-    for value, name in info.values.items():
-        yield format_value(value), name
-    for bit, name in info.bits.items():
-        yield f"bit {bit}", name
+        yield f"units:{units}"
+    yield from (f"{each}: {found[each]}{units}" for each in ("increment", "default") if each in found)
+    yield from (f"{value}: {name}" for value, name in found.get("values", {}).items())
+    yield from (f"bit {bit}: {name}" for bit, name in found.get("bits", {}).items())
     if info.is_read_only:
-        yield "read-only", "the vehicle sets it"
+        yield "read-only: the vehicle sets it"
     if info.reboot_required:
-        yield "reboot", "a change takes effect after a reboot"
+        yield "reboot: a change takes effect after a reboot"

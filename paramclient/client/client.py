@@ -522,9 +522,9 @@ class ParamClient:
         began = anyio.current_time()
         station = self.core.station
         system, component = asked
-        for number in asked:
-            if number is not None and not 0 <= number <= 255:
-                raise UsageError(f"system and component ids are 0 to 255, not {number}")
+        for number, least in zip(asked, (1, 0), strict=True):
+            if number is not None and not least <= number <= 255:
+                raise UsageError(f"system ids are 1 to 255, component ids 0 to 255, not {number}")
         probe_at = 0.0 if system and component else math.inf
         found = choose()
         with anyio.move_on_after(timeout):

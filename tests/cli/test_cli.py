@@ -664,6 +664,16 @@ def on_terminal(*arguments: object, **environment: str) -> Outcome:
         os.close(ours)
 
 
+def test_a_rate_is_that_of_a_while(
+    command: Command, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    shown = command("fetch", "sim:px4", "--no-cache").err
+    rates = [int(rate) for rate in re.findall(r"/903 ([0-9]+)/s", shown)]
+    assert len(rates) > 5
+    assert max(rates) < 1500  # a thousand parameters per second are sent
+
+
 def test_progress_is_drawn_on_a_terminal(tmp_path: Path) -> None:
     shown = on_terminal("fetch", "sim:px4", "--no-cache")
     assert shown.code == 0

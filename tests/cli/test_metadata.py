@@ -163,6 +163,6 @@ def test_show_prints_the_metadata_of_a_parameter(command: Command, put: Put) -> 
         "TST_ALT: Return height",
         "  How high to return",
         "  range: 30 to 3000.5 cm",
-        "  step: 1 cm",
+        "  increment: 1 cm",
         "  reboot: a change takes effect after a reboot",
     ]

@@ -97,8 +97,8 @@ def test_watch_follows_groups_that_appear(command: Command, put: Put) -> None:
     assert sorted(line for line in found if not line.startswith("1/1 resynced")) == [
         "GRP_ENABLE  0 -> 1  (vehicle)",
         "GRP_ENABLE  1 -> 0  (vehicle)",
-        "GRP_ONE  added: 1.0  (vehicle)",
-        "GRP_ONE  removed, was 1.0  (vehicle)",
-        "GRP_TWO  added: 2.0  (vehicle)",
-        "GRP_TWO  removed, was 2.0  (vehicle)",
+        "GRP_ONE  1.0 -> none  (vehicle)",
+        "GRP_ONE  none -> 1.0  (vehicle)",
+        "GRP_TWO  2.0 -> none  (vehicle)",
+        "GRP_TWO  none -> 2.0  (vehicle)",
     ]

@@ -214,6 +214,7 @@ def test_kinds_and_addresses_in_the_cache(command: Command, put: Put) -> None:
     several = command("show", "ardupilot")
     assert (several.code, several.err.count("\n  ")) == (2, 2)
     assert "fits 2 vehicles in the cache" in several.err
+    assert re.search(r"Choose one by its key, as uid:[0-9a-f]+\.", several.err)
     missing = command("show", "4/9")
     assert missing.code == 2
     assert "no vehicle has system id 4 and a table of component 9" in missing.err
