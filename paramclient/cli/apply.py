@@ -18,14 +18,7 @@ from cyclopts import Parameter
 from paramclient import errors
 from paramclient.cli.cached import parse_time
 from paramclient.cli.json_output import JsonObject, apply_json, plan_json, row_json, rows_json
-from paramclient.cli.metadata import (
-    MetadataChoice,
-    default_in,
-    known_of_session,
-    no_defaults,
-    request_from_vehicle,
-    say_sources,
-)
+from paramclient.cli.metadata import MetadataChoice, default_in, known_of_session, no_defaults, say_sources
 from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import Coloured, ExitCode, Status, can_ask, code_of, confirm, listed, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, check_given, get_chosen, sessions
@@ -46,6 +39,7 @@ _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be reve
 """Words for planned actions in the summary, where they differ from the status."""
 _INCLUDABLE: Final = frozenset(CATEGORIES) - {READ_ONLY}
 """Categories of left-out parameters that --include writes; the vehicle lets no client write the others."""
+_LATE: Final = "takes effect after a reboot"
 _SNAPSHOT: Final = re.compile("[0-9]{1,18}")
 """The number of a snapshot; all other texts are times."""
 _OPTIONS: Final = ApplyFlags()
@@ -245,7 +239,7 @@ async def _defaults(
     known = await known_of_session(session, choice)
     if known is None and any(param.default is None for param in params):
         with suppress(errors.UsageError, errors.VehicleError, errors.NoReply):  # it gives no metadata
-            known = await request_from_vehicle(session)
+            known = await known_of_session(session, "vehicle")
     found = {param.name: default_in(known, param) for param in params}
     wanted = {name: default.value for name, default in found.items() if default is not None}
     if not wanted:
@@ -392,7 +386,7 @@ class _Job:
         made = self.found
         if not isinstance(made, Plan) or self._is_refused(made):
             return False
-        return bool(made.to_write) or (self.options["reboot"] and bool(made.awaiting_reboot))
+        return bool(made.to_write or (self.options["reboot"] and made.awaiting_reboot))
 
     def _is_refused(self, made: Plan) -> bool:
         """Return whether the plan has problems, and nothing is written because of them."""
@@ -423,58 +417,53 @@ class _Job:
         Returns:
             The exit code; of a plan, the one that the command is expected to have.
         """
-        found, label, reboots = self.found, self.session.label, self.options["reboot"]
+        found, session, remarks = self.found, self.session, list[str]()
         words = ", ".join(f"{count} {_WORDS.get(status, status)}" for status, count in found.counts.items())
-        summary = f"{self.session.receiver}: {words or 'nothing to set'}"
+        summary = f"{session.receiver}: {words or 'nothing to set'}"
+        skipped = [row.category for row in found.of(ApplyStatus.SKIPPED) if row.differs]
+        if left_out := Counter(category for category in skipped if category in _INCLUDABLE):
+            counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
+            options = " ".join(f"--include {category}" for category in left_out)
+            remarks.append(f"left out: {counts}; to write them: {options}")
         if isinstance(found, Plan):
-            made, end, to_reboot = found, "; nothing was sent", found.reboot_for
-            to_reboot += found.awaiting_reboot if reboots else ()
+            say(f"{summary}; nothing was sent")
+            names = found.reboot_for + (found.awaiting_reboot if self.options["reboot"] else ())
+            verb = "reboots for" if self.options["reboot"] else _LATE
+            remarks += [
+                found.unchecked_note,
+                f"{verb}: {listed(names)}" if names else "",
+                found.firmware_note,
+            ]
+            code = self._judge(found)
         elif isinstance(found, ApplyResult):
-            made, end, to_reboot = found.plan, f" in {found.elapsed:.1f} s", found.reboot_required
+            say(f"{summary} in {found.elapsed:.1f} s")
+            late = found.reboot_required
+            remarks += [found.plan.unchecked_note, f"{_LATE}: {listed(late)}" if late else ""]
+            if found.system != session.component.system:
+                remarks.append(f"the vehicle is {found.system}/{found.component} now")
+            code = ExitCode.DONE if found.complete else ExitCode.INCOMPLETE
         else:  # interrupted
             say(summary)
             return ExitCode.DONE
-        say(f"{summary}{end}")
-        skipped = found.of(ApplyStatus.SKIPPED)
-        if left_out := Counter(
-            row.category for row in skipped if row.differs and row.category in _INCLUDABLE
-        ):
-            counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
-            options = " ".join(f"--include {category}" for category in left_out)
-            say(f"{label}: left out: {counts}; to write them: {options}")
-        if made.unchecked_note:
-            say(f"{label}: {made.unchecked_note}")
-        if to_reboot:
-            verb = "reboots for" if reboots and found is made else "takes effect after a reboot"
-            say(f"{label}: {verb}: {listed(to_reboot)}")
-        code = self._report_plan(found) if isinstance(found, Plan) else self._report_result(found)
+        for remark in filter(None, remarks):
+            say(f"{session.label}: {remark}")
+        if isinstance(found, ApplyResult) and found.error is not None:
+            report(f"{session.label}: {found.error}; run it again to continue")
+            code = max(code, code_of(found.error))
         return max(code, ExitCode.INCOMPLETE) if self.state.is_part else code
 
-    def _report_plan(self, made: Plan) -> int:
-        """Print what the firmware and the armed state say about a plan, and whether it is refused."""
+    def _judge(self, made: Plan) -> ExitCode:
+        """Print whether nothing would be written now; return the exit code that the command would have."""
         label, code = self.session.label, ExitCode.DONE
-        if made.firmware_note:
-            say(f"{label}: {made.firmware_note}")
         if any(not row.is_as_wanted for row in made.of(ApplyStatus.SKIPPED, ApplyStatus.INVALID)):
             code = ExitCode.INCOMPLETE
         if self.session.component.is_armed and not self.options["allow_armed"]:
             report(f"{label} is armed; nothing would be set now without --allow-armed")
             code = ExitCode.INCOMPLETE
         if self._is_refused(made):
-            names = listed([*made.problems])
-            report(f"{label}: nothing would be sent without --partial: {names}")
+            report(f"{label}: nothing would be sent without --partial: {listed([*made.problems])}")
             code = ExitCode.USAGE
         return code
-
-    def _report_result(self, result: ApplyResult) -> int:
-        """Print a new system id, and the error that ended the run."""
-        session = self.session
-        if result.system != session.component.system:
-            say(f"{session.address} is {result.system}/{result.component} now")
-        if result.error is not None:
-            report(f"{session.label}: {result.error}; run it again to continue")
-            return max(code_of(result.error), ExitCode.INCOMPLETE)
-        return ExitCode.DONE if result.complete else ExitCode.INCOMPLETE
 
 
 def _cells(row: ApplyRow, reason: str) -> Sequence[object]:

@@ -16,7 +16,7 @@ from cyclopts.validators import Number
 from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
 from paramclient.cli.metadata import MetadataChoice, info_of, known_of_session
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import Coloured, Status, code_of, listed, report, require_consent, say
+from paramclient.cli.output import Coloured, Status, code_of, report, require_consent, say
 from paramclient.cli.session import CommandSession, Sessions, Shown, sessions, spelling
 from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
@@ -188,7 +188,7 @@ class SetJob:
         arrived: the outcomes so far, by name.
     """
 
-    columns: ClassVar[Sequence[str]] = ("name", "requested", "actual", "status")
+    columns: ClassVar[Sequence[str]] = ("name", "requested", "actual", "status", "reason")
 
     session: CommandSession
     settle: float
@@ -248,31 +248,20 @@ class SetJob:
         """Yield the rows; the reported value with its meaning, if that is known."""
         for each in self.as_json()["results"]:
             actual = each["actual"] if "text" not in each else f"{each['actual']} ({each['text']})"
-            yield each["name"], each["requested"], actual, Coloured(each["status"], STYLES[each["status"]])
+            is_late = each["actual"] is not None and each.get("reboot_required")
+            late = "takes effect after a reboot" if is_late else None
+            reason = None if each["status"] == SetStatus.NOT_TRIED else each.get("reason")
+            reasons = filter(None, (reason, each.get("note"), late))
+            status = Coloured(each["status"], STYLES[each["status"]])
+            yield each["name"], each["requested"], actual, status, "; ".join(reasons) or None
 
     def report(self) -> int:
-        """Print counts, remarks, and errors: one for all values without a response, and for one cause."""
-        prefix, counts = self.session.prefix, Counter(each.status for each in self.outcomes)
+        """Print the number of values with each outcome, and once why values were not tried."""
+        counts = Counter(each.status for each in self.outcomes)
         if not self.session.options.json:
-            done = counts.pop(SetStatus.ACCEPTED, 0) + counts.pop(SetStatus.ADJUSTED, 0)
-            others = [f"{counts[status]} {status}" for status in SetStatus if status in counts]
-            say(f"{', '.join([f'{done} of {len(self.writes)} set', *others])} on {self.session.receiver}")
-        late, errors = list[str](), dict[str, str]()
-        for each in self.arrived.values():
-            info = info_of(self.described, each.name)
-            if each.is_set and info is not None and info.reboot_required:
-                late.append(each.name)
-            if each.result is not None and each.result.note:
-                say(f"{prefix}{each.name}: {each.result.note}")
-            if each.error is not None:
-                text = str(each.error)
-                if each.status in (SetStatus.UNKNOWN, SetStatus.NOT_TRIED):
-                    errors.setdefault(each.status, text)
-                else:
-                    errors[each.name] = text if each.name in text else f"{each.name}: {text}"
-        if late:
-            say(f"{prefix}takes effect after a reboot: {listed(late)}")
-        for text in errors.values():
-            report(f"{prefix}{text}")
-        codes = [code_of(each.error) for each in self.arrived.values() if each.error is not None]
-        return max(codes, default=0)
+            words = ", ".join(f"{counts[status]} {status}" for status in SetStatus if status in counts)
+            say(f"{self.session.receiver}: {words}")
+        errors = [(each.status, each.error) for each in self.arrived.values() if each.error is not None]
+        if untried := [error for status, error in errors if status is SetStatus.NOT_TRIED]:
+            report(f"{self.session.prefix}{untried[0]}")
+        return max((code_of(error) for _, error in errors), default=0)

@@ -12,14 +12,7 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient.cli.json_output import JsonObject, diff_json, taken
-from paramclient.cli.metadata import (
-    METADATA_HINT,
-    MetadataFile,
-    defaults_in,
-    known_of_sets,
-    no_defaults,
-    say_sources,
-)
+from paramclient.cli.metadata import MetadataFile, defaults_in, known_of_sets, no_defaults, say_sources
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     Coloured,
@@ -286,8 +279,8 @@ async def diff(
     if base == DEFAULTS:
         try:
             before = collect_defaults([first, second], [*map(defaults_in, known, (first, second))])
-        except UsageError as error:
-            raise UsageError(f"{error}; {METADATA_HINT}") from None
+        except UsageError:
+            raise UsageError(no_defaults()) from None
         known.append(known[0] or known[1])
     outcome = compare(first, second, base=before, names=only or None)
     found = diff_json(outcome, [*known, None][:3], has_defaults=base == DEFAULTS)

@@ -192,7 +192,7 @@ def test_nan_can_be_forced(command: Command) -> None:
     refused = command("set", "sim:px4", *wanted, "MC_YAW_P", 3, "--json", "--no-cache")
     assert refused.code == 2
     assert [each["status"] for each in refused.json["results"]] == ["refused", "refused", "accepted"]
-    assert "PX4 cannot save NaN and infinity" in refused.err
+    assert "PX4 cannot save NaN and infinity" in refused.json["results"][0]["reason"]
     done = command("set", "sim:px4", *wanted, "--force", "--json", "--no-cache")
     assert done.json["results"] == [
         {"name": "MC_ROLL_P", "requested": "NaN", "actual": "NaN", "status": "accepted"},

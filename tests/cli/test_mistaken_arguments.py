@@ -69,7 +69,7 @@ def test_an_unknown_name_has_one_exit_code_and_a_suggestion(
     assert command("fetch", url).code == 0
     done = command(*(url if word == "LINK" else word for word in words))
     assert done.code == 2
-    assert "did you mean MC_ROLL_P?" in done.err
+    assert "did you mean MC_ROLL_P?" in done.out + done.err
     assert "writing to" not in done.err
 
 
