@@ -55,7 +55,7 @@ async def read(session: Session, which: str | int) -> ReportedValue:
     """
     spelled = session.spelled(which) if isinstance(which, str) else which
     if spelled != which:
-        with suppress(UnknownParameter):
+        with suppress(UnknownParameter, NoReply):
             return await _read(session, spelled)
     return await _read(session, which)
 
@@ -208,12 +208,13 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
 
     That is the same parameter by its index, where that is known: some components answer no read by name.
     """
-    px4 = session.identification.is_px4
+    answers_names = session.channel.answered.is_set() and session.serves_reads.get(str) is not False
+    px4 = session.identification.is_px4 and answers_names
     live = {name: param.index for name, param in session.table.params.items() if param.trust is Trust.LIVE}
     same = live.pop(which, None) if isinstance(which, str) else None
     other = next(iter(live), 0) if same is None else same
     control = await _try(session, HASH_CHECK if px4 else other)
-    if control is None and px4 and session.channel.answered.is_set():  # it may only call itself a PX4
+    if control is None and px4:  # it may only call itself a PX4
         control = await _try(session, other)
     is_proven = not isinstance(which, str) or session.serves_reads.get(str)
     if control is None or is_proven or control.param_id == which:
