@@ -6,8 +6,6 @@ import ctypes
 import os
 import random
 import resource
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +15,6 @@ from typing import Any
 import paramclient
 from paramclient.cache import (
     BY_VEHICLE,
-    CachedComponent,
     HistoryEntry,
     ParamCache,
     StoredParam,
@@ -105,14 +102,6 @@ def changes(cache: ParamCache, name: str | None = None) -> list[HistoryEntry]:
     return cache.history(table.key, table.component, name)
 
 
-def extended(cache: ParamCache, key: str | None = None) -> CachedComponent:
-    """The only table of extended parameters, or that of a vehicle."""
-    [table] = [each for each in cache.components(extended=True) if key in (None, each.key)]
-    found = cache.load(table.key, table.component, extended=True)
-    assert found is not None
-    return found
-
-
 def rubbish(size: int, seed: int = 1) -> bytes:
     """What begins as one of our files does, and is none any more."""
     content = bytearray(random.Random(seed).randbytes(size))
@@ -170,19 +159,3 @@ def full_disk(at: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-@contextmanager
-def start(program: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """Run a Python program, which can import what this one can, and end it with the block."""
-    with subprocess.Popen(
-        [sys.executable, "-c", program, *map(str, arguments)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()

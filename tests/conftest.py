@@ -53,11 +53,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _in_virtual_time(item: pytest.Function) -> Callable[..., object]:
-    """Run a test of conversations on trio, and any other on the loop of the client's tests."""
+    """Run a test of conversations, or for both backends, as those are, others on the client's loop."""
     from tests.conversations.virtual import virtual
     from tests.shell import in_simulated_time
 
-    return (virtual if item.path.parent.name == "conversations" else in_simulated_time)(item.obj)
+    backend = str(item.callspec.params.get("backend", "")) if hasattr(item, "callspec") else ""
+    if not backend and item.path.parent.name != "conversations":
+        return in_simulated_time(item.obj)
+    return virtual(item.obj, backend or "trio")
+
+
+@pytest.fixture(params=["trio", "asyncio"])
+def backend(request: pytest.FixtureRequest) -> str:
+    """The event loop of a test that runs on both; see `virtual_on_both`."""
+    return str(request.param)
 
 
 def _use_home(environment: pytest.MonkeyPatch, home: Path) -> Path:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 from uuid import uuid4
 
@@ -53,7 +54,9 @@ class Server:
             self._user = "nobody"
             user = pwd.getpwnam(self._user)
             os.chown(folder, user.pw_uid, user.pw_gid)
-        self._run("initdb", "--auth=trust", "--encoding=UTF8", "--locale=C", "--username=tests", "--no-sync")
+        words = ("--auth=trust", "--encoding=UTF8", "--locale=C", "--username=tests", "--no-sync")
+        command: list[Path | str] = [PROGRAMS / "initdb", "-D", folder / "data", *words]
+        subprocess.run(command, user=self._user, cwd=folder, check=True, capture_output=True)
 
     @property
     def url(self) -> str:
@@ -79,25 +82,16 @@ class Server:
                 return
 
     def _launch(self) -> subprocess.Popen[bytes]:
-        settings = {
-            "listen_addresses": "",
-            "unix_socket_directories": self.folder,
-            "fsync": "off",
-            "max_connections": 60,
-            "shared_buffers": "32MB",
-        }
+        settings = {"listen_addresses": "", "unix_socket_directories": self.folder, "fsync": "off"}
+        settings |= {"max_connections": 60, "shared_buffers": "32MB"}
+        words = (word for name, value in settings.items() for word in ("-c", f"{name}={value}"))
+        quiet: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
         return subprocess.Popen(
-            [
-                self._programs / "postgres",
-                *("-D", self.folder / "data"),
-                *(word for name, value in settings.items() for word in ("-c", f"{name}={value}")),
-            ],
+            [self._programs / "postgres", "-D", self.folder / "data", *words],
             user=self._user,
             cwd=self.folder,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
             start_new_session=True,
+            **quiet,
         )
 
     def kill(self) -> None:
@@ -117,15 +111,6 @@ class Server:
             self._process.send_signal(signal.SIGQUIT)
             self._process.wait()
             self._process = None
-
-    def _run(self, program: str, *arguments: str) -> None:
-        subprocess.run(
-            [self._programs / program, "-D", self.folder / "data", *arguments],
-            user=self._user,
-            cwd=self.folder,
-            check=True,
-            capture_output=True,
-        )
 
 
 @contextmanager

@@ -271,11 +271,11 @@ def _requests(name: str) -> list[tuple[float, messages.Message]]:
 def _request_of(answer: tuple[float, messages.Message], requests: Messages) -> float:
     """Return the time of the request that a message answers; without a request, the message's own time."""
     received, message = answer
-    times = [time for time, request in requests if time <= received and _answers(message, request)]
+    times = [time for time, request in requests if time <= received and answers(message, request)]
     return max(times, default=received)
 
 
-def _answers(message: messages.Message, request: messages.Message) -> bool:
+def answers(message: messages.Message, request: messages.Message) -> bool:
     match request:
         case messages.ParamRequestList():
             return isinstance(message, messages.StatusText) or (

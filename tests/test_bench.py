@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -42,23 +41,6 @@ def test_links_prints_the_row_of_exactly_this_name() -> None:
     figures = re.fullmatch(rf"{name} +(\S+) +(\S+) +(\S+) +(\S+) +\d+ +\d+ +\d+  2/2.*", row)
     assert figures, text
     assert all(0.3 < float(figure) < 60 for figure in figures.groups()), text  # simulated seconds
-
-
-def test_the_oracle_by_file_waits_one_round_trip_for_what_was_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without loss it takes two round trips, the second to close the session, and the burst. What is lost
-    then costs whole round trips."""
-    monkeypatch.syspath_prepend(ROOT / "bench")
-    from oracle import TellingLink, file_oracle_time
-
-    def seconds(loss: float, trip: float) -> float:
-        links = [TellingLink(loss=loss, delay=trip / 2, seed=seed) for seed in (1, 2)]
-        vehicle = partial(ArduPilotVehicle, ftp_rate=48_500.0)
-        return file_oracle_time(vehicle, *links, burst_rate=48_500.0, reads_per_second=547.0)
-
-    burst = seconds(0.0, 0.0)
-    assert 0.3 < burst < 0.4
-    assert seconds(0.0, 2.5) == pytest.approx(burst + 2 * 2.5, abs=0.01)
-    assert burst + 2 * 2.5 < seconds(0.05, 2.5) < burst + 5 * 2.5
 
 
 def test_gateway_prints_a_table() -> None:

@@ -312,15 +312,3 @@ def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
     )
     assert run.stdout.strip() == "[]"
-
-
-def test_the_version_stands_in_one_place() -> None:
-    from paramclient.version import __version__
-
-    assert [
-        f"{module}:{node.lineno}"
-        for module in MODULES
-        for node in ast.walk(source_of(module))
-        if isinstance(node, ast.Constant) and node.value == __version__ and inside(module) != "version"
-    ] == []
-    assert __version__ not in (ROOT / "pyproject.toml").read_text(encoding="utf-8")

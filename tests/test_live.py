@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import anyio
@@ -15,7 +15,7 @@ import anyio.lowlevel
 import pytest
 
 from paramclient.model.values import ParamType, Value
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
 from tests.live import __main__ as suite
 from tests.live.checks import Check, Session, checks
 from tests.simulated_on_udp import flying
@@ -42,8 +42,8 @@ GROUP: dict[str, dict[str, Value | tuple[ParamType, Value]]]
 GROUP = {"GRIP_ENABLE": {"GRIP_GRAB": (ParamType.INT16, 1900), "GRIP_REGRAB": 1.5}}
 
 
-def px4(*, armed: bool = False) -> PX4Vehicle:
-    return PX4Vehicle(table=PX4_TABLE, armed=armed)
+def px4() -> PX4Vehicle:
+    return PX4Vehicle(table=PX4_TABLE)
 
 
 def ardupilot() -> ArduPilotVehicle:
@@ -135,6 +135,25 @@ def test_a_failed_live_check_restores_the_vehicle(
         assert "get by index" not in found
 
 
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [([], 2, "is armed"), (["--kind", "ardupilot"], 2, "not ardupilot"), (["--read-only"], 0, "skipped")],
+)
+def test_an_armed_or_another_vehicle_is_not_written(
+    arguments: list[str],
+    code: int,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    having(monkeypatch, "set, INT32", "get by index")
+    with flying(vehicle := PX4Vehicle(table=PX4_TABLE, armed=True)) as link:
+        assert suite.main([link, *arguments]) == code
+    printed = capsys.readouterr()
+    assert words in printed.out + printed.err
+    assert vehicle.requests["PARAM_SET"] == 0
+
+
 async def change_behind_its_back(session: Session) -> str:
     async with session.client() as vehicle:
         await vehicle.set("SDLOG_DIRS_MAX", 3)
@@ -153,34 +172,3 @@ def test_a_state_that_is_not_the_one_before_fails_and_stays_on_disk(
     assert "SDLOG_DIRS_MAX was 7, is 3" in printed
     (file,) = tmp_path.glob("*/before.json")
     assert f"paramclient restore {link} {file}" in printed
-
-
-@pytest.mark.parametrize(
-    ("endpoint", "arguments", "words"),
-    [
-        (px4(armed=True), [], "is armed"),
-        (px4(), ["--kind", "ardupilot"], "the vehicle is px4, not ardupilot"),
-        (Air([px4(), ArduPilotVehicle(table=ARDUPILOT_TABLE, system=2)]), [], "2 vehicles on this link"),
-    ],
-)
-def test_the_live_checks_refuse_to_begin(
-    endpoint: Vehicle | Air, arguments: Sequence[str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    vehicles = endpoint.vehicles if isinstance(endpoint, Air) else (endpoint,)
-    with flying(endpoint) as link:
-        assert suite.main([link, *arguments]) == 2
-    assert words in capsys.readouterr().err
-    for vehicle in vehicles:
-        assert isinstance(vehicle, Vehicle)
-        assert vehicle.requests["PARAM_SET"] == 0
-
-
-def test_read_only_changes_nothing(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    vehicle = px4(armed=True)
-    having(monkeypatch, "set, INT32", "get by index")
-    with flying(vehicle) as link:
-        assert suite.main([link, "--read-only"]) == 0
-    assert results(capsys.readouterr().out)["set, INT32"] == "skipped"
-    assert vehicle.requests["PARAM_SET"] == 0

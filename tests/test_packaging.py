@@ -68,18 +68,9 @@ def test_pytest_finds_the_plugin(wheel: dict[str, bytes], tmp_path: Path) -> Non
         (tmp_path / "site" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "site" / name).write_bytes(content)
     (tmp_path / "test_it.py").write_text("def test_it(sim_px4):\n    assert sim_px4(table={}).air\n")
+    options = ("-p", "no:cacheprovider", "-p", "no:asyncio", "-W", "error::pytest.PytestWarning")
     done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-p",
-            "no:cacheprovider",
-            "-p",
-            "no:asyncio",
-            "-W",
-            "error::pytest.PytestWarning",
-        ],
+        [sys.executable, "-m", "pytest", *options],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(tmp_path / "site")},
         capture_output=True,
@@ -92,14 +83,7 @@ def test_pytest_finds_the_plugin(wheel: dict[str, bytes], tmp_path: Path) -> Non
 
 def test_the_sdist_can_be_built_and_tested(sdist: set[str]) -> None:
     assert sdist >= SOURCES | TABLES | SERVED | {PLUGIN}
-    assert sdist >= {
-        "pyproject.toml",
-        "README.md",
-        "CHANGELOG.md",
-        "LICENSE",
-        "Makefile",
-        "docs/conf.py",
-    }
+    assert sdist >= {"pyproject.toml", "README.md", "CHANGELOG.md", "LICENSE", "Makefile", "docs/conf.py"}
     data = (path for path in (ROOT / "tests/data").rglob("*") if path.is_file())
     assert sdist >= {path.relative_to(ROOT).as_posix() for path in data}
     assert not {name for name in sdist if "__pycache__" in name or name.startswith((".venv", "docs/_build"))}

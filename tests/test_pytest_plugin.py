@@ -17,7 +17,6 @@ from paramclient.testing import SimVehicle, sim_ardupilot, sim_px4
 pytest_plugins = ("pytester",)
 
 ROOT = Path(__file__).parent.parent
-TABLE = {"MC_ROLL_P": 6.5, "SYS_AUTOSTART": 4001, "BAT_LOW_THR": 0.25}
 
 Suite = Callable[..., pytest.RunResult]
 
@@ -97,19 +96,6 @@ def test_the_users_cache_is_the_users_again():
     assert not BEFORE.exists()
 """
 
-LATE = """
-import sys
-
-
-def test_nothing_is_loaded():
-    assert "pytest_paramclient" in sys.modules
-    assert not [name for name in sys.modules if name.split(".")[0] in ("paramclient", "pymavlink")]
-
-
-def test_now_it_is(sim_px4):
-    assert "paramclient.sim" in sys.modules
-"""
-
 
 def test_fixtures_work_with_every_runner(suite: Suite) -> None:
     """With pytest-asyncio, with anyio's plugin and with neither; includes the documentation's programs."""
@@ -122,14 +108,6 @@ def test_fixtures_work_with_every_runner(suite: Suite) -> None:
     assert len(tests) >= 3
     assert all(tests)
     suite(**modules).assert_outcomes(passed=sum(map(len, tests)))
-
-
-@pytest.mark.slow
-def test_the_package_loads_with_the_first_test_that_uses_a_fixture(suite: Suite) -> None:
-    """A suite without the fixtures does not pay for the import, and coverage starts before it."""
-    result = suite("--cov=paramclient.version", "--cov-report=term-missing", test_late=LATE)
-    result.assert_outcomes(passed=2)
-    result.stdout.re_match_lines([r".*paramclient/version\.py +\d+ +0 .*100%"])
 
 
 # the makers themselves
@@ -145,18 +123,3 @@ async def test_a_pace_is_that_of_the_list(make: Callable[..., SimVehicle[Vehicle
         result = await component.fetch_all(progress=lambda _: times.append(anyio.current_time()))
     assert result.source == "stream"
     assert times[-1] - times[0] == pytest.approx(400 / pace, rel=0.05, abs=0.4)
-
-
-@pytest.mark.parametrize("make", [sim_px4, sim_ardupilot])
-def test_equal_seeds_lose_the_same_packets(make: Callable[..., SimVehicle[Vehicle]]) -> None:
-    def losses(seed: int) -> list[float]:
-        vehicle = make(table=TABLE, loss=0.5, seed=seed)
-        lost = []
-        for second in range(60):
-            vehicle.tick(float(second))
-            vehicle.data_to_send()
-            lost.append(vehicle.air.downlink.lost / vehicle.air.downlink.sent)
-        return lost
-
-    assert losses(1) == losses(1) != losses(2)
-    assert 0.3 < losses(1)[-1] < 0.7

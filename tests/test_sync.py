@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import signal
 import subprocess
@@ -178,12 +177,3 @@ def test_a_program_that_does_not_close_its_client_keeps_its_values(tmp_path: Pat
     assert done.returncode == (1 if "/" in end else 0), done.stderr
     with ParamCache(path) as cache:
         assert cache.component().params[NAME].value == 6.0
-
-
-def test_a_forgotten_client_ends() -> None:
-    client = ParamClient("sim:px4", cache=False).open()
-    (thread,) = [each for each in threading.enumerate() if each.name.startswith("paramclient")]
-    del client
-    gc.collect()
-    thread.join(10.0)
-    assert not thread.is_alive()

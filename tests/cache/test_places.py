@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -19,7 +21,6 @@ from tests.caches import (
     read_only,
     rubbish,
     set_aside,
-    start,
     stored,
     update,
     values,
@@ -145,6 +146,14 @@ def test_a_folder_in_which_nothing_can_be_written(path: Path) -> None:
         assert len(values(cache)) == 3
 
 
+def test_a_place_that_cannot_be(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with ParamCache(tmp_path / "file" / "cache") as cache, pytest.raises(CacheError, match="cannot be used"):
+        cache.save(whole_table(1))
+    with pytest.raises(UsageError, match="not valid"):
+        ParamCache("postgresql://a b")
+
+
 def test_a_full_disk_loses_nothing(path: Path) -> None:
     filled(path)
     with ParamCache(path) as cache:
@@ -153,12 +162,6 @@ def test_a_full_disk_loses_nothing(path: Path) -> None:
         assert len(values(cache)) == 3
         cache.save(whole_table(4))
         assert len(values(cache)) == 4
-
-
-def test_a_folder_that_is_a_file(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with ParamCache(tmp_path / "file" / "cache") as cache, pytest.raises(CacheError, match="cannot be used"):
-        cache.save(whole_table(1))
 
 
 # several processes
@@ -179,11 +182,10 @@ with ParamCache(path) as cache:
 
 
 def test_several_processes_write_to_one_new_place(place: str) -> None:
-    programs = [start(WRITER, number, place) for number in range(4)]
-    running = [program.__enter__() for program in programs]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    program = [sys.executable, "-c", WRITER]
+    running = [subprocess.Popen([*program, str(number), place], env=environment) for number in range(4)]
     assert [process.wait(60) for process in running] == [0, 0, 0, 0]
-    for program in programs:
-        program.__exit__(None, None, None)
     with ParamCache(place) as cache:
         assert len(cache.components()) == 2
         assert {len(cache.history(each.key)) for each in cache.vehicles()} == {2 * 39}
@@ -201,11 +203,6 @@ def test_an_unreachable_database_is_an_error_without_the_password(tmp_path: Path
             with pytest.raises(CacheError, match="cannot be used") as caught:
                 cache.components()
             assert "cret" not in str(caught.value)
-
-
-def test_a_url_that_is_none() -> None:
-    with pytest.raises(UsageError, match="not valid"):
-        ParamCache("postgresql://a b")
 
 
 def test_a_lost_connection_is_opened_again(place: str, open_cache: Open) -> None:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from dataclasses import replace
 from random import Random
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -13,7 +12,6 @@ from hypothesis import strategies as st
 
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
-from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import hash_bits
 from paramclient.model.values import Param, ParamType, Trust, ext_param, from_bits
 from tests.cache.conftest import Open
@@ -143,17 +141,6 @@ def test_a_durable_write_is_on_the_disk(cache: ParamCache, open_cache: Open) -> 
 # which observation counts
 
 
-@pytest.mark.parametrize("is_swapped", [False, True])
-def test_the_later_observation_counts(cache: ParamCache, is_swapped: bool) -> None:
-    updates = [update(stored("A", number, at=NOW + number), at=NOW + number) for number in (1, 2)]
-    for each in reversed(updates) if is_swapped else updates:
-        cache.save(each)
-    assert values(cache) == {"A": 2}
-    assert [(line.old.value, line.new and line.new.value) for line in cache.history("1")] == (
-        [] if is_swapped else [(1, 2)]
-    )
-
-
 def test_an_older_identity_does_not_replace_a_newer_one(cache: ParamCache) -> None:
     cache.save(update(at=NOW + 10, identity=replace(PX4, firmware=2)))
     cache.save(update(at=NOW, identity=replace(PX4, firmware=1)))
@@ -185,17 +172,6 @@ def test_a_removal_before_the_last_observation_has_no_effect(cache: ParamCache) 
     assert values(cache) == {"A": 1}
     cache.save(update(removed={"A": NOW + 6}, at=NOW + 6))
     assert values(cache) == {}
-
-
-def test_after_the_clock_was_set_back_new_observations_count(cache: ParamCache) -> None:
-    ahead = time.time() + 3600
-    cache.save(update(stored("A", 1, at=ahead), at=ahead))
-    now = time.time()
-    cache.save(update(stored("A", 2, at=now), at=now, table=TableState(7, 1, complete=True)))
-    assert values(cache) == {"A": 2}
-    later = time.time()
-    cache.save(update(stored("A", 3, at=later), at=later))
-    assert values(cache) == {"A": 3}
 
 
 Event = tuple[int, int, int]
@@ -240,84 +216,42 @@ def test_two_writers_in_any_order(place: str, events: list[Event], random: Rando
     assert all(kept[name] == value for name, value in last.items())
 
 
-def test_many_writers_at_once(open_cache: Open) -> None:
-    """50 components are written by four programs; none waits for the others for long."""
-    identities = [replace(PX4, uid=f"{number:04x}", system=number + 1) for number in range(50)]
-
-    def write(cache: ParamCache, mine: list[Identity]) -> None:
-        for identity in mine:
-            cache.save(whole_table(200, identity))
-
-    threads = [
-        threading.Thread(target=write, args=(open_cache(), identities[number::4])) for number in range(4)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    found = open_cache().components()
-    assert len(found) == 50
-    assert {each.size for each in found} == {200}
-
-
 # when a hash holds
 
 
-def test_a_hash_stays_with_its_table(cache: ParamCache) -> None:
+def later(name: str, bits: int, seconds: float = 1, **more: Any) -> TableUpdate:
+    """One value that is received later than the table."""
+    index, volatile = more.pop("index", None), more.pop("volatile", None)
+    row = stored(name, bits, index=index, volatile=volatile, at=NOW + seconds)
+    return update(row, at=NOW + seconds, **more)
+
+
+@pytest.mark.parametrize(
+    ("updates", "is_kept"),
+    [
+        ([], True),
+        ([later("P_0", 9)], False),
+        ([later("V", 1, index=3, volatile=True), later("V", 2, 2)], True),
+        ([later("P_0", 9, 5), hashed_table(1, 2, 3, at=NOW + 4)], False),
+        ([later("P_0", 9), later("P_1", 8, 2, table=hashed_table(1, 8, 3).table)], False),
+        ([later("P_0", 1, table=TableState(None, 3))], True),
+        ([later("P_0", 1, table=TableState(None, 4))], False),
+    ],
+    ids=["nothing", "a change", "volatile", "overtaken", "by others", "received less", "another count"],
+)
+def test_a_hash_stays_with_its_table_while_it_holds(
+    cache: ParamCache, updates: list[TableUpdate], is_kept: bool
+) -> None:
+    """Two programs may write the changes that each has received, and the hash of what each holds."""
     cache.save(hashed_table(1, 2, 3))
-    table = cache.component("1")
-    assert table.hash == hash_bits({each.name: each.bits for each in params_of(1, 2, 3)})
-    assert (table.complete, table.volatile_known, table.synced_at) == (True, True, NOW)
-
-
-def test_a_changed_value_without_a_new_hash_removes_the_hash(cache: ParamCache) -> None:
-    cache.save(hashed_table(1, 2, 3))
-    cache.save(update(stored("P_0", 9, at=NOW + 1), at=NOW + 1))
-    assert cache.component("1").hash is None
-
-
-def test_a_changed_volatile_value_keeps_the_hash(cache: ParamCache) -> None:
-    cache.save(hashed_table(1, 2, 3))
-    hash_ = cache.component("1").hash
-    cache.save(update(stored("VOLATILE", 1, index=3, volatile=True, at=NOW + 1), at=NOW + 1))
-    cache.save(update(stored("VOLATILE", 2, at=NOW + 2), at=NOW + 2))
-    table = cache.component("1")
-    assert table.hash == hash_
-    assert table.volatile == {"VOLATILE"}
-
-
-def test_a_hash_of_overtaken_values_is_not_stored(cache: ParamCache) -> None:
-    """Another program has stored a later value than the one for which this hash was announced."""
-    cache.save(hashed_table(1, 2, 3))
-    cache.save(update(stored("P_0", 9, at=NOW + 5), at=NOW + 5))
-    cache.save(hashed_table(1, 2, 3, at=NOW + 4))
-    assert cache.component("1").hash is None
-    assert values(cache)["P_0"] == 9
-
-
-def test_a_hash_that_the_values_do_not_have_confirms_nothing(cache: ParamCache) -> None:
-    """Two programs write the changes that each has received, and the hash of what each holds."""
-    cache.save(hashed_table(1, 2, 3))
-    cache.save(update(stored("P_0", 9, at=NOW + 1), at=NOW + 1))
-    digest = hash_bits({each.name: each.bits for each in params_of(1, 8, 3)})
-    state = TableState(digest, 3, complete=True, volatile_known=True)
-    cache.save(update(stored("P_1", 8, at=NOW + 2), at=NOW + 2, table=state))
-    assert cache.component("1").hash is None
+    for each in updates:
+        cache.save(each)
+    table, digest = cache.component("1"), hash_bits({each.name: each.bits for each in params_of(1, 2, 3)})
+    assert table.hash == (digest if is_kept else None)
+    assert not is_kept or (table.complete, table.volatile_known, table.synced_at) == (True, True, NOW)
 
 
 def test_a_part_of_a_table_is_not_complete(cache: ParamCache) -> None:
     """The table was removed while a program still used it, which writes a single change of it."""
-    state = TableState(0xCF579589, 3, complete=True)
-    cache.save(update(stored("PARAM_0", 1, index=0), table=state))
-    table = cache.component("1")
-    assert (table.complete, table.hash) == (False, None)
-
-
-def test_a_program_that_has_received_less_keeps_the_state(cache: ParamCache) -> None:
-    cache.save(hashed_table(1, 2, 3))
-    before = cache.component("1")
-    cache.save(update(stored("P_0", 1, at=NOW + 1), at=NOW + 1, table=TableState(None, 3)))
-    after = cache.component("1")
-    assert (after.hash, after.complete, after.synced_at) == (before.hash, True, NOW)
-    cache.save(update(stored("P_0", 1, at=NOW + 2), at=NOW + 2, table=TableState(None, 4)))
-    assert (cache.component("1").hash, cache.component("1").complete) == (None, False)
+    cache.save(update(stored("PARAM_0", 1, index=0), table=TableState(0xCF579589, 3, complete=True)))
+    assert (cache.component("1").complete, cache.component("1").hash) == (False, None)

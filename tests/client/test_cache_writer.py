@@ -313,22 +313,6 @@ async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(pa
     ]
 
 
-async def test_a_write_without_a_waiting_caller_is_reported_as_ours(path: Path) -> None:
-    vehicle = small_px4()
-    await session(vehicle, path)
-    async with fetched(Air.symmetric([vehicle], delay=0.2), cache=path) as (_, component):
-        await component.get("PARAM_01")
-        with anyio.move_on_after(0.1):
-            await component.set("PARAM_01", 100, author="anna")
-        await asyncio.sleep(1)
-        assert component.params["PARAM_01"].value == 100
-        await asyncio.sleep(10)
-        vehicle.set_param("PARAM_01", 7)
-        await asyncio.sleep(1)
-        await component.get("PARAM_01")
-    assert [line[2:] for line in history(path, "PARAM_01")] == [(100, "us for anna"), (7, "vehicle")]
-
-
 async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_before(path: Path) -> None:
     vehicle = small_px4()
     before, vehicle_had = (vehicle.param(name).value for name in ("PARAM_01", "PARAM_02"))

@@ -21,10 +21,9 @@ from paramclient import Component, ParamClient
 from paramclient.sim import Air, PX4Vehicle
 from paramclient.wire import messages
 from tests.caches import set_aside
-from tests.client.conftest import connected, fetched, table_in
+from tests.client.conftest import fetched, table_in
 from tests.shell import (
     VALUES,
-    FlakyLink,
     a_client,
     bits,
     generic,
@@ -129,21 +128,6 @@ async def test_cancelled_at_each_point(call: Call, how: str) -> None:
         if not is_struck:
             break
     assert 1 < number < POINTS_MAX - 1
-
-
-@EVERY_CALL
-async def test_cancelled_while_the_link_is_disconnected(call: Call) -> None:
-    link = FlakyLink(Air([small_px4(), generic(system=2)]))
-    async with connected(link) as (client, component):
-        await link.drop(stays_offline=True)
-        task = asyncio.create_task(call(client, component))
-        await asyncio.sleep(1.0)
-        task.cancel()
-        await asyncio.wait([task])
-        assert is_idle(client)
-        link.is_offline = False
-        await asyncio.sleep(1.0)
-        await check_after(call, client, component)
 
 
 async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import pytest
 
 from paramclient import Component, ParamCache, ParamClient, Trust
 from paramclient.sim import Air, Camera
-from tests.caches import extended
 from tests.shell import small_px4
 
 TABLE: dict[str, int | float | str | bytes] = {"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_ISO": 100}
@@ -18,7 +17,9 @@ TABLE: dict[str, int | float | str | bytes] = {"CAM_MODE": 1, "CAM_NAME": "Front
 
 def kept(path: Path) -> dict[str, object]:
     with ParamCache(path) as cache:
-        return {name: param.value for name, param in extended(cache).params.items()}
+        [table] = cache.components(extended=True)
+        params = cache.component(table.key, component=100, extended=True).params
+        return {name: param.value for name, param in params.items()}
 
 
 def history(path: Path) -> list[tuple[str, object, object, str]]:

@@ -9,12 +9,10 @@ from typing import Any
 import anyio
 import pytest
 
-from paramclient import ClientClosed, NoReply
-from paramclient.errors import LinkError
-from paramclient.links import SimLink
+from paramclient import NoReply
 from paramclient.sim import Air, ArduPilotVehicle
 from tests.client.conftest import connected
-from tests.shell import FlakyLink, Tap, outcome, tasks_beside
+from tests.shell import FlakyLink, outcome, tasks_beside
 
 LOG = bytes(range(256)) * 200
 """A file of 51,200 bytes, which takes a second."""
@@ -74,56 +72,6 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
         assert not vehicle.open_files
         requests += vehicle.requests["FILE_TRANSFER_PROTOCOL"]
     assert requests > 80
-
-
-@pytest.mark.parametrize(
-    ("make", "closes_after", "longest"),
-    [
-        pytest.param(SimLink, None, 0.1, id="none"),
-        pytest.param(SimLink, None, 2.0, id="deaf"),
-        pytest.param(FlakyLink, 0.0, 0.0, id="dropped"),
-        pytest.param(SimLink, 0.0, 0.0, id="failed"),
-        pytest.param(FlakyLink, 0.1, 0.1, id="drops"),
-        pytest.param(SimLink, 0.1, 0.1, id="fails"),
-    ],
-)
-async def test_a_scope_ends_a_client_on_any_link(
-    make: Any, closes_after: float | None, longest: float
-) -> None:
-    vehicle = with_files()
-    tap = Tap(Air.symmetric([vehicle], delay=0.05))
-    link, is_deaf = make(tap), longest > 1.0
-
-    async def close_link(after: float) -> None:
-        await anyio.sleep(after)
-        await link.close()
-
-    async with anyio.create_task_group() as beside:
-        with anyio.CancelScope() as scope:
-            async with connected(link) as (_, component):
-                reading = asyncio.ensure_future(outcome(component.read_file("/APM/LOGS/1.BIN")))
-                await anyio.sleep(0.3)
-                assert vehicle.open_files
-                tap.is_deaf = is_deaf
-                if closes_after is not None:
-                    beside.start_soon(close_link, closes_after)
-                if closes_after == 0.0:
-                    await anyio.sleep(0.01)
-                scope.cancel()
-                cancelled_at = anyio.current_time()
-                await anyio.sleep_forever()
-        assert scope.cancelled_caught
-        assert anyio.current_time() - cancelled_at <= longest + 0.01
-    ending = await reading
-    assert isinstance(ending, LinkError)
-    assert isinstance(ending, ClientClosed) == (make is FlakyLink or closes_after != 0.0)
-    for _ in range(120):  # a burst of a second, which the vehicle ends first
-        await anyio.sleep(0.01)
-        tap.tick(anyio.current_time())
-        tap.data_to_send()
-    assert bool(vehicle.open_files) == (is_deaf or closes_after == 0.0)
-    assert not tasks_beside()
-    assert isinstance(await outcome(component.file_checksum("/x")), ClientClosed)
 
 
 async def test_a_read_goes_on_when_the_link_is_back() -> None:

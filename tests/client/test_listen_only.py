@@ -132,16 +132,6 @@ async def test_fetch_all_without_any_request_of_others_ends_with_no_reply(timeou
         assert residue(component) == []
 
 
-async def test_a_timeout_returns_what_was_received() -> None:
-    channel = Channel(small_px4(dead=[24]))
-    async with listener(channel) as client:
-        component = await client.component()
-        channel.ask(LIST)
-        result = await component.fetch_all(timeout=2.0)
-        assert result.missing == (24,)
-        assert "ended at its timeout" in result.notes[0]
-
-
 async def test_a_cached_table_is_confirmed_by_a_hash_that_others_ask_for(tmp_path: Path) -> None:
     vehicle = small_px4()
     path = tmp_path / "cache"

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
 from pathlib import Path
 from unittest import mock
 
-import anyio
 import pytest
 
-from paramclient import Param, SetOutcome, SetStatus, errors
+from paramclient import SetOutcome, SetStatus, errors
 from paramclient.client.cache_writer import CacheWriter
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire import messages
@@ -19,10 +17,6 @@ from tests.shell import VALUES, Tap, a_client, residue, small_px4
 
 MANY: dict[str, int | float] = {f"MANY_{number:03}": float(number) for number in range(200)}
 NEW: dict[str, int | float] = {name: value + 0.5 for name, value in MANY.items()}
-
-
-def values_of(params: Mapping[str, Param], names: Mapping[str, object]) -> dict[str, object]:
-    return {name: params[name].value for name in names}
 
 
 async def test_each_value_has_an_outcome_of_its_own() -> None:
@@ -108,18 +102,3 @@ async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Pa
     with pytest.raises(errors.UsageError, match="durable"):
         async with a_client(small_px4()) as client:
             await (await client.component()).set_many({"PARAM_01": 2}, durable=True)
-
-
-async def test_two_calls_at_once_both_end() -> None:
-    vehicle = PX4Vehicle(table=MANY)
-    async with fetched(Air.symmetric([vehicle], delay=0.05, loss=0.1)) as (_, component):
-        results = []
-
-        async def set_all(values: Mapping[str, int | float]) -> None:
-            results.append(await component.set_many(values))
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(set_all, NEW)
-            tasks.start_soon(set_all, dict(reversed(MANY.items())))
-        assert all(result.is_complete for result in results)
-        assert values_of(vehicle.params, NEW) == values_of(component.params, NEW)

@@ -58,20 +58,6 @@ def test_a_file_holds_a_key_as_it_is_or_as_text(tmp_path: Path, data: bytes) -> 
             read_key(path)
 
 
-@pytest.mark.parametrize(
-    "data", [b"", b"hunter2-hunter2", SECRET[:31], SECRET + b"\n", b"\xff" * 44, bytes(32), b"ab" * 600]
-)
-def test_a_file_without_a_key_is_named_and_not_quoted(tmp_path: Path, data: bytes) -> None:
-    path = tmp_path / "no.key"
-    path.write_bytes(data)
-    path.chmod(0o600)
-    with pytest.raises(UsageError) as caught:
-        read_key(path)
-    assert str(caught.value).startswith(f"{path}: a signing key ")
-    shown = "".join(traceback.format_exception(caught.value))
-    assert not data or data.decode("latin-1") not in shown
-
-
 def test_the_environment_names_a_key_in_one_of_three_ways(tmp_path: Path) -> None:
     file = tmp_path / "key"
     file.write_bytes(SECRET)

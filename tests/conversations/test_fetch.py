@@ -15,8 +15,6 @@ from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, V
 from paramclient.wire import messages
 from tests.conversations.virtual import Silence, Tap, converse, meanwhile, run, talking, virtual_on_both
 
-BACKENDS = pytest.mark.parametrize("backend", ["trio", "asyncio"])
-
 
 def new_vehicle(kind: str, **options: object) -> Vehicle:
     """Return a vehicle: px4, ardupilot (with its parameter file), list (ArduPilot without it) or generic."""

@@ -16,7 +16,7 @@ from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.ftp import FileCutOff, Opcode, Packet, checksum, path_bytes, read_file
 from paramclient.protocol.param_pck import PackedParam, encode
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
-from paramclient.wire.messages import FileTransfer, Message, ParamRequestList, ParamValue
+from paramclient.wire.messages import FileTransfer, Message, ParamValue
 from tests.conversations.virtual import Silence, Tap, losing, talking, virtual_on_both
 
 BOTH = pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
@@ -168,6 +168,7 @@ async def test_uses_of_mavftp_take_turns() -> None:
     vehicle.files.update(files)
     async with talking(Air.symmetric([vehicle], delay=0.02)) as (_, session):
         got: dict[str, bytes] = {}
+        began = anyio.current_time()
 
         async def fetch(path: str) -> None:
             got[path] = await read_file(session.channel, path)
@@ -177,7 +178,7 @@ async def test_uses_of_mavftp_take_turns() -> None:
                 tasks.start_soon(fetch, path)
             tasks.start_soon(checksum, session.channel, "0.bin")
         assert got == files
-        assert anyio.current_time() < 3.0
+        assert anyio.current_time() - began < 3.0
 
 
 # the parameter file
@@ -243,18 +244,6 @@ async def test_integers_of_a_file_are_exact_and_keep_so_beside_rounded_messages(
         assert session.table.params[name].value == 2**24 + 1
         default = session.table.params[name].default
         assert isinstance(default, int)
-
-
-async def test_a_refused_file_is_not_requested_again_on_the_link() -> None:
-    vehicle = PX4Vehicle(param_error=True)  # claims to have it, and answers: file not found
-    async with talking(vehicle) as (conversation, session):
-        await session.identification.settled()
-        for _ in range(2):
-            result = await fetch_all(session, refresh=True)
-            assert (result.source, bool(result.missing)) == ("stream", False)
-        requests = [each.opcode for each in packets_in(conversation.sent_of(FileTransfer))]
-        assert requests.count(Opcode.OPEN_FILE_RO) <= 1
-        assert len(conversation.sent_of(ParamRequestList)) == 2
 
 
 async def test_a_lost_opening_of_the_file_is_repeated_before_the_list_is_taken() -> None:

@@ -10,12 +10,11 @@ import pytest
 
 from paramclient.errors import LinkError, NoReply, ParamErrorCode, Refused, UnknownParameter
 from paramclient.model.values import ParamType, Trust
-from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read, read_many
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire.messages import Message, ParamError, ParamRequestRead, ParamValue
-from tests.conversations.virtual import Puppet, Silence, Tap, converse, meanwhile, talking, virtual_on_both
+from tests.conversations.virtual import Puppet, Silence, converse, meanwhile, talking, virtual_on_both
 
 TABLE = {"RTL_ALT": 1500, "MC_ROLL_P": 6.5, "MC_PITCH_P": 6.5}
 MAKERS = {
@@ -58,16 +57,6 @@ async def test_silence_to_one_read_of_many_is_no_such_parameter(
             await read(session, which)
         assert (caught.value.name if isinstance(which, str) else caught.value.index) == which
         assert ("MC_ROLL_P" in str(caught.value)) is (vehicle_has_roll and which == "MC_ROLLP")
-
-
-async def test_an_unknown_name_on_a_bad_link_is_never_taken_for_silence_nor_a_known_one_for_unknown() -> None:
-    for seed in range(6):
-        air = Air.symmetric([PX4Vehicle()], loss=0.3, delay=0.05, seed=seed)
-        async with talking(air) as (_, session):
-            await read(session, "MC_ROLL_P")
-            with pytest.raises(UnknownParameter):
-                await read(session, "NO_SUCH")
-            await read(session, "MC_PITCH_P")
 
 
 async def test_silence_is_no_reply_and_not_an_unknown_parameter() -> None:
@@ -124,17 +113,6 @@ async def test_a_refusal_tells_its_reason(which: str | int, code: int, kind: typ
         assert (caught.value.name if isinstance(which, str) else caught.value.index) == which
         if isinstance(caught.value, Refused):
             assert caught.value.reason == ("read fail" if code != 77 else "error code 77")
-
-
-async def test_a_parameter_that_answers_by_its_index_only_is_read_by_that() -> None:
-    vehicle = GenericVehicle(TABLE)
-    endpoint = Tap(vehicle, up=lambda each: not isinstance(each, ParamRequestRead) or not each.param_id)
-    async with talking(endpoint) as (_, session):
-        await fetch_all(session)
-        await anyio.sleep(1.0)  # late answers
-        vehicle.set_param("MC_ROLL_P", 3.0)
-        await read(session, "MC_ROLL_P")
-        assert session.table.params["MC_ROLL_P"].value == 3.0
 
 
 async def test_an_ardupilot_takes_names_in_any_case_and_its_table_has_one_of_each() -> None:

@@ -137,39 +137,6 @@ async def test_a_growing_count_is_never_complete_without_its_end(
             assert not result.complete or len(result.params) == 40
 
 
-@pytest.mark.parametrize("interval", [0.3, 0.7, 1.0])
-@pytest.mark.parametrize("heartbeat", [QUIET, PX4], ids=["generic", "PX4"])
-async def test_a_slow_list_with_a_growing_count_is_received(
-    interval: float, heartbeat: messages.Heartbeat
-) -> None:
-    async with talking(Puppet(lambda message: (), heartbeat=heartbeat)) as (conversation, session):
-
-        async def send_list() -> None:
-            while not conversation.sent_of(messages.ParamRequestList):  # noqa: ASYNC110 - in virtual time
-                await anyio.sleep(0.01)
-            for index in range(12):
-                conversation.hear(
-                    messages.ParamValue(f"P{index}", bytes(4), ParamType.REAL32, index + 1, index)
-                )
-                await anyio.sleep(interval)
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(send_list)
-            result = await fetch_all(session)
-            assert (result.complete, len(result.params)) == (True, 12)
-
-
-@pytest.mark.parametrize("size", [1, 8])
-@pytest.mark.parametrize("delay", [0.5, 1.25])
-async def test_the_end_of_a_list_without_a_count_is_not_sought_for_long(delay: float, size: int) -> None:
-    table = {f"P{number}": (number, ParamType.REAL32) for number in range(size)}
-    vehicle = Partial(table, count=lambda index: index + 1)
-    async with talking(Air.symmetric([vehicle], delay=delay)) as (_, session):
-        with anyio.fail_after(15.0):
-            result = await fetch_all(session)
-            assert (result.complete, len(result.params)) == (True, size)
-
-
 @pytest.mark.parametrize("count", [9, 3_008, 65_535])
 async def test_a_count_that_is_too_large_costs_seconds_and_no_value(count: int) -> None:
     async with talking(Partial(count=lambda index: count)) as (conversation, session):
@@ -239,10 +206,11 @@ async def test_a_listed_value_is_taken_before_the_end(
     table = {name: (value, ParamType.REAL32) for name, (value, _) in TABLE.items()}
     vehicle = Partial(table, serves=parts, heartbeat=heartbeat, count=lambda index: count)
     async with talking(vehicle) as (_, session):
+        began = anyio.current_time()
         await read(session, "OFFSET")
-        assert anyio.current_time() < 8.5
+        assert anyio.current_time() - began < 8.5
         assert (await write(session, "MODE", 4)).status == "accepted"
-        assert anyio.current_time() < 12.0
+        assert anyio.current_time() - began < 12.0
         assert not session.listing.is_running
 
 

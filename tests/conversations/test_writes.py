@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Awaitable, Callable, Iterable
-from dataclasses import replace
 from typing import Any
 
 import anyio
@@ -20,7 +19,6 @@ from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.wire.messages import (
-    NO_INDEX,
     AutopilotVersion,
     CommandLong,
     Message,
@@ -271,21 +269,6 @@ async def test_values_of_one_parameter_are_set_in_the_order_of_the_call() -> Non
         assert vehicle.param("RTL_ALT").value == values[-1]
 
 
-async def test_an_acknowledgement_to_another_station_changes_no_type() -> None:
-    """ArduPilot acknowledges the set of a default as REAL32, whatever the type is."""
-    vehicle = ArduPilotVehicle(live_period=0.0)
-    async with talking(vehicle) as (conversation, session):
-        await fetch_all(session)
-        before = session.table.params["RTL_ALT"]
-        acknowledgement = struct.pack("<f", 1500.0), ParamType.REAL32, session.table.count or 0, NO_INDEX
-        conversation.hear(ParamValue("RTL_ALT", *acknowledgement))
-        assert session.table.params["RTL_ALT"] == replace(before, value=1500, bits=1500)
-        result = await write(session, "RTL_ALT", 1600)
-        assert (result.status, result.param.type, result.attempts) == ("accepted", before.type, 1)
-        assert [each.param_type for each in conversation.sent_of(ParamSet)] == [before.type]
-        assert vehicle.param("RTL_ALT").value == 1600
-
-
 @virtual_on_both
 @pytest.mark.parametrize("timeout", [None, 2.0], ids=["lost", "at the timeout"])
 async def test_values_are_accepted_though_they_could_not_be_watched(timeout: float | None) -> None:
@@ -354,20 +337,6 @@ async def test_another_vehicle_gets_no_set_and_a_rebooted_one_the_others(
         assert (first if is_same else other).param(names[-1]).value == 0.5
 
 
-async def test_no_set_is_sent_to_a_vehicle_that_does_not_say_again_which_one_it_is() -> None:
-    async with talking(endpoint := Tap(PX4Vehicle())) as (conversation, session):
-        await read(session, "MC_ROLL_P")
-        await anyio.sleep(1.0)
-        endpoint.up = lambda message: not isinstance(message, CommandLong)
-        conversation.station.interrupt()
-        conversation.station.resume(anyio.current_time())
-        with pytest.raises(errors.NoReply, match="the identity of 1/1"), anyio.fail_after(10.0):
-            await write(session, "MC_ROLL_P", 3.5)
-        assert not conversation.sent_of(ParamSet)
-        endpoint.up = lambda message: True
-        assert (await write(session, "MC_ROLL_P", 3.5)).status == "accepted"
-
-
 @virtual_on_both
 async def test_another_vehicle_behind_a_value_ends_a_write_and_no_read() -> None:
     table = {"A": (5.0, ParamType.REAL32), "B": (6.0, ParamType.REAL32)}
@@ -434,18 +403,6 @@ async def test_a_switch_and_the_parameters_behind_it_are_set_in_one_call() -> No
         assert (session.table.count, hidden in session.table.params) == (count, False)
         kinds = [each.kind for each in conversation.changes if each.name == hidden]
         assert kinds[-1] == "removed"
-
-
-async def test_a_link_that_fails_ends_a_batch_and_the_others_are_not_tried() -> None:
-    vehicle = PX4Vehicle()
-    async with talking(Air.symmetric([vehicle], delay=0.3)) as (conversation, session):
-        names = [each.name for each in vehicle.listed if each.type is ParamType.REAL32][:60]
-        pairs: list[tuple[str, Value]] = [(name, 0.25) for name in names]
-        async with meanwhile(write_many(session, pairs)) as results:
-            await anyio.sleep(2.0)
-            conversation.station.fail(errors.LinkError("gone", link="x"), for_good=True)
-        assert isinstance(results[0].error, errors.LinkError)
-        assert {each.status for each in results[0].outcomes} >= {SetStatus.UNKNOWN, SetStatus.NOT_TRIED}
 
 
 @pytest.mark.parametrize(("rate", "after"), [(2_000, 1.0), (4_000, 0.3), (8_000, 0.3)])

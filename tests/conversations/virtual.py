@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-import inspect
 import random
-import selectors
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import asynccontextmanager, suppress
 from functools import wraps
@@ -26,35 +23,12 @@ from paramclient.protocol.table import Change
 from paramclient.sim import Endpoint
 from paramclient.wire.frames import Framer
 from paramclient.wire.messages import DECODED_IDS, Heartbeat, Message, decode, encode
-from tests.shell import outcome
+from tests.shell import SimulatedTimeLoop, outcome, simulated_time_loop
 
 T = TypeVar("T")
 
 TIME_LIMIT = 300.0
 """Virtual seconds after which a test hangs."""
-
-
-class _JumpingSelector(selectors.SelectSelector):
-    """Waits for nothing: the time of the wait passes at once."""
-
-    passed = 0.0
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        ready = super().select(0)
-        if not ready and timeout is None:
-            raise RuntimeError("nothing will ever happen")
-        if not ready and timeout:
-            self.passed += timeout
-        return ready
-
-
-class _VirtualLoop(asyncio.SelectorEventLoop):
-    def __init__(self) -> None:
-        self.jumps = _JumpingSelector()
-        super().__init__(self.jumps)
-
-    def time(self) -> float:
-        return self.jumps.passed
 
 
 def run(test: Callable[..., Awaitable[T]], *arguments: Any, backend: str = "trio") -> T:
@@ -70,7 +44,7 @@ def run(test: Callable[..., Awaitable[T]], *arguments: Any, backend: str = "trio
         scheduling._ALLOW_DETERMINISTIC_SCHEDULING, scheduling._r = True, random.Random(0)
         options: dict[str, Any] = {"clock": MockClock(autojump_threshold=0)}
     else:
-        options = {"loop_factory": _VirtualLoop}
+        options = {"loop_factory": SimulatedTimeLoop}
     return anyio.run(limited, backend=backend, backend_options=options)
 
 
@@ -81,33 +55,21 @@ def jump(seconds: float) -> None:
         assert isinstance(clock, MockClock)
         clock.jump(seconds)
     else:
-        loop = asyncio.get_running_loop()
-        assert isinstance(loop, _VirtualLoop)
-        loop.jumps.passed += seconds
+        simulated_time_loop().now += seconds
 
 
-def virtual(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
-    """Make an async test one that runs in virtual time on trio."""
+def virtual(test: Callable[..., Awaitable[None]], backend: str = "trio") -> Callable[..., None]:
+    """Make an async test one that runs in virtual time."""
 
     @wraps(test)
     def wrapper(*arguments: Any, **options: Any) -> None:
-        run(lambda: test(*arguments, **options))
+        run(lambda: test(*arguments, **options), backend=backend)
 
     return wrapper
 
 
-def virtual_on_both(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
-    """Make an async test one that runs in virtual time on trio, and on asyncio."""
-
-    @wraps(test)
-    def wrapper(*arguments: Any, backend: str, **options: Any) -> None:
-        run(lambda: test(*arguments, **options), backend=backend)
-
-    signature = inspect.signature(test)
-    backend = inspect.Parameter("backend", inspect.Parameter.KEYWORD_ONLY, annotation=str)
-    with_backend = signature.replace(parameters=[*signature.parameters.values(), backend])
-    wrapper.__signature__ = with_backend  # type: ignore[attr-defined]  # of every function, for pytest
-    return pytest.mark.parametrize("backend", ["trio", "asyncio"])(wrapper)  # type: ignore[no-any-return]
+virtual_on_both = pytest.mark.usefixtures("backend")
+"""Runs an async test in virtual time on trio, and on asyncio."""
 
 
 class Conversation:

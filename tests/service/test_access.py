@@ -1,4 +1,4 @@
-"""Who may do what: tokens and their roles, other sites, host names, sizes, addresses."""
+"""Who may do what: tokens, roles, other sites, host names, sizes; and what no program of ours sends."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from paramclient.errors import UsageError
 from paramclient.service import Hub, Tokens, add_token, create_app, read_tokens, serve
 from tests.service.hub import V, browsing, problem, service, synced
-from tests.shell import generic
+from tests.shell import VALUES, generic
 
 READS = {
     "POST /api/files",
@@ -216,3 +216,83 @@ def test_an_invalid_token_file_is_refused_without_its_content(tmp_path: Path, te
     with pytest.raises(UsageError) as refused:
         read_tokens(file)
     assert "secret-token-itself" not in str(refused.value)
+
+
+# broken bodies, wrong types, odd addresses
+
+BROKEN = [
+    b"",
+    b"null",
+    b"[]",
+    b"7",
+    b'"text"',
+    b"{",
+    b"\xff\xfe\x00",
+    b'{"value": 1e999}',
+    b'{"values": {"PARAM_04": ' + b"9" * 5_000 + b"}}",
+    b'{"value": NaN, "values": NaN, "reason": NaN, "at": NaN, "refresh": NaN, "text": NaN}',
+    b'{"value": "\\ud800", "values": {"\\ud800": "\\udfff"}, "reason": "\\ud800", "text": "\\ud800"}',
+    b'{"values": {"PARAM_04": {"deep": ' + b"[" * 5_000 + b"]" * 5_000 + b"}}}",
+    b'{"values": {"": 1}, "value": [], "at": {}, "file": 1, "only": 1, "include": "x", "force": 7}',
+]
+REFUSED: list[tuple[str, str, dict[str, Any]]] = [
+    ("PUT", "params/PARAM_04", {}),
+    ("PUT", "params/PARAM_04", {"value": 1, "settel_s": 1}),
+    ("PUT", "params/PARAM_04", {"value": True}),
+    ("PUT", "params/PARAM_04", {"value": None}),
+    ("PUT", "params/PARAM_04", {"value": [1]}),
+    ("PUT", "params/PARAM_04", {"value": {"bits": "0"}}),
+    ("PUT", "params/PARAM_04", {"value": 1, "timeout_s": -1}),
+    ("PUT", "params/PARAM_04", {"value": "x" * 1000}),
+    ("POST", "apply", {}),
+    ("POST", "apply", {"values": {"PARAM_04": 1}, "at": 1}),
+    ("POST", "apply", {"values": {}}),
+    ("POST", "plan", {"file": {"name": "x"}}),
+    ("POST", "plan", {"values": {"A_NAME_THAT_IS_LONG": 1}}),
+    ("POST", "restore", {"at": True}),
+    ("POST", "restore", {"at": 0}),
+    ("POST", "restore", {"at": "2026-11-20T14:00"}),
+    ("POST", "snapshots", {"reason": ""}),
+    ("POST", "fetch", {"refresh": "maybe", "x": 1}),
+]
+
+
+async def test_no_broken_body_is_taken_or_breaks_the_service() -> None:
+    vehicle = generic()
+    async with service(vehicle) as (hub, browser):
+        await synced(browser)
+        for method, address, _ in requests_of(create_app(hub)):
+            for body in BROKEN if method != "GET" else ():
+                for media_type in ("application/json", "text/plain"):
+                    headers = {"Content-Type": media_type}
+                    answer = await browser.request(method, address, content=body, headers=headers)
+                    assert 400 <= answer.status_code < 500, (address, body[:80], answer.text)
+                    assert answer.headers["content-type"] == "application/problem+json"
+        assert {name: vehicle.param(name).value for name in VALUES} == VALUES
+
+
+async def test_odd_addresses_and_queries_are_problems() -> None:
+    async with browsing(generic()) as browser:
+        for address in (
+            *(
+                f"/api/vehicles/{each}/params"
+                for each in ("0/1", "256/1", "one/1", "1/-1", f"{'9' * 5_000}/1")
+            ),
+            *(f"{V}/params?at={each}" for each in ("0", "9" * 5_000, "2026-11-20T14:00", "yesterday")),
+            *(f"{V}/params?link={'x' * 201}", f"{V}/params?ext=perhaps", f"{V}/file?format=exe"),
+            *(f"{V}/history?{each}" for each in ("limit=0", f"name={'N' * 17}", "since=yesterday")),
+        ):
+            problem(await browser.get(address), 422, "invalid-request")
+        for address in ("/api/nothing", "/api/vehicles/1/1", "/../tokens", "/%2e%2e/app.py", "/app.py"):
+            assert (await browser.get(address)).status_code == 404, address
+        for name in ("%00", "..%2F..%2Fetc", "%F0%9F%9B%A9", "A" * 17):
+            assert (await browser.get(f"{V}/params/{name}")).status_code in (404, 422), name
+            answer = await browser.put(f"{V}/params/{name}", json={"value": 1})
+            assert answer.status_code in (404, 422), name
+        assert (await browser.request("DELETE", f"{V}/params")).status_code == 405
+
+
+async def test_senseless_bodies_are_refused() -> None:
+    async with browsing(generic()) as browser:
+        for method, what, body in REFUSED:
+            problem(await browser.request(method, f"{V}/{what}", json=body), 422, "invalid-request")
