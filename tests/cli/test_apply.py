@@ -406,23 +406,30 @@ class Interrupting(GenericVehicle):
 
 
 @pytest.mark.parametrize("as_json", [False, True])
-def test_ctrl_c_prints_the_outcomes_so_far(command: Command, put: Put, file: File, as_json: bool) -> None:
+@pytest.mark.parametrize("name", ["apply", "set"])
+def test_ctrl_c_prints_the_outcomes_so_far(
+    command: Command, put: Put, file: File, name: str, as_json: bool
+) -> None:
     names = [f"P{number:02}" for number in range(40)]
     vehicle = Interrupting(dict.fromkeys(names, 1))
-    wanted = file("".join(f"{name},2\n" for name in names))
-    outcome = command("apply", put(vehicle), wanted, *(["--json"] if as_json else []))
+    wanted = [file("".join(f"{each},2\n" for each in names))]
+    if name == "set":
+        wanted = [f"{each}=2" for each in names]
+    outcome = command(name, put(vehicle), *wanted, *(["--json"] if as_json else []))
     assert outcome.code == 130
-    done = sum(value == 2 for value in vehicle.values.values())
-    assert done < 40
-    if as_json:
+    assert re.search("^interrupted: .*; run it again", outcome.err, re.MULTILINE)
+    assert any(value == 2 for value in vehicle.values.values())
+    if not as_json:
+        place = 4 if name == "apply" else -1
+        shown = {row[0]: row[place] for row in outcome.rows[1:]}
+    elif name == "apply":
         assert (outcome.json["complete"], outcome.json["error"]) == (False, "interrupted")
-        shown = [row["status"] for row in outcome.json["params"].values()]
+        shown = {each: row["status"] for each, row in outcome.json["params"].items()}
     else:
-        shown = [row[4] for row in outcome.rows[1:]]
-        assert re.search(r": \d+ unproven\ninterrupted: .*; run it again", outcome.err)
-    assert set(shown) == {"unproven"}
-    assert len(shown) <= done
-    assert command("apply", put(vehicle), wanted).code == 0
+        shown = {row["name"]: row["status"] for row in outcome.json["results"]}
+    assert {*shown.values()} == ({"unproven"} if name == "apply" else {"accepted", "unknown"})
+    assert all(vehicle.values[each] == 2 for each, status in shown.items() if status != "unknown")
+    assert command(name, put(vehicle), *wanted).code == 0
     assert set(vehicle.values.values()) == {2}
 
 

@@ -133,13 +133,6 @@ def test_the_defaults_are_a_base(command: Command) -> None:
 
 
 @pytest.mark.usefixtures("two")
-def test_partial_leaves_out_only_parameters_of_the_right_side(command: Command) -> None:
-    names = set(command("diff", 1, 2, "--partial", "--json").json["params"])
-    assert names == set(command("diff", 1, 2, "--json").json["params"]) - {"D_RIGHT"}
-    assert "C_LEFT" in names
-
-
-@pytest.mark.usefixtures("two")
 def test_only_compares_the_named_parameters(command: Command) -> None:
     assert command("diff", 1, 2, "--only", "A_*", "--only", "E_BOTH").code == 0
     narrowed = command("diff", 1, 2, "--only", "?_FLOAT", "--json")
@@ -208,13 +201,6 @@ def test_an_existing_file_has_precedence(command: Command, write: Write, tmp_pat
     assert command("diff", "2", "2").code == 0
 
 
-def test_a_damaged_file_is_exit_code_2(command: Command, write: Write) -> None:
-    write("\x1bquad.param", "A,1", "B,one")
-    outcome = command("diff", "\x1bquad.param", "\x1bquad.param")
-    assert (outcome.code, outcome.out) == (2, "")
-    assert outcome.err.startswith("paramclient: \\x1bquad.param:2: ")
-
-
 def test_a_name_that_no_vehicle_has_is_left_out(command: Command, write: Write) -> None:
     left, right = write("left.param", "A,1", "SIM_GPS1_BYTELOSS,0"), write("right.param", "A,1")
     for words in (["diff", left, right], ["show", left]):
@@ -268,16 +254,3 @@ def test_two_links_are_compared(command: Command, vehicles: dict[str, Vehicle]) 
     assert outcome.json["params"]["B"]["changed_side"] == "right"
     assert (outcome.json["left"]["system"], outcome.json["right"]["system"]) == (1, 7)
     assert outcome.json["right"]["source"] == "link tcp:two:1"
-
-
-def test_parameters_missing_from_a_link_are_named(command: Command, vehicles: dict[str, Vehicle]) -> None:
-    vehicles["tcp:one:1"] = GenericVehicle({"A": 1, "B": 2}, dead=["B"])
-    vehicles["tcp:two:1"] = GenericVehicle({"A": 1, "B": 2})
-    outcome = command("diff", "tcp:one:1", "tcp:two:1", "--timeout", 1)
-    assert (outcome.code, outcome.out) == (1, "")
-    assert "1/1 generic on tcp:one:1 is incomplete: index 1 was not received" in outcome.err
-
-
-def test_a_failed_link_ends_the_comparison(command: Command) -> None:
-    outcome = command("diff", "tcp:127.0.0.1:1", "udpin:127.0.0.1:0")
-    assert (outcome.code, outcome.out) == (4, "")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -118,27 +117,6 @@ def test_what_apply_leaves_out_is_left_out_unless_it_is_named(
     assert (named.code, named.rows[1][-2]) == (1, "refused")
 
 
-@pytest.mark.parametrize("names", [["COUNT", "MC_ROLLP"], ["COUNT", "NOT_*"]])
-def test_with_an_unknown_name_nothing_is_written(command: Command, put: Put, names: list[str]) -> None:
-    tap = Tap(copter())
-    done = command("reset", put(tap), *names)
-    assert (done.code, done.out, written(tap)) == (2, "", [])
-    expected = "no parameter that matches NOT_*" if "NOT_*" in names else "; did you mean MC_ROLL_P?"
-    assert expected in done.err
-
-
 @pytest.mark.parametrize("words", [[], ["A", "--all"], ["--all", "--changed"]])
 def test_names_all_and_changed_exclude_each_other(command: Command, put: Put, words: list[str]) -> None:
     assert command("reset", put(copter()), *words).code == 2
-
-
-def test_the_user_of_a_terminal_confirms(
-    command: Command, put: Put, at_terminal: Callable[[str], None]
-) -> None:
-    tap = Tap(copter())
-    at_terminal("n")
-    done = command("reset", put(tap), "COUNT")
-    assert (done.code, "go on? [y/N]" in done.err, written(tap)) == (1, True, [])
-    for words in (["COUNT", "--yes"], ["COUNT", "--json"], ["MC_PITCH_P"]):
-        done = command("reset", put(Tap(copter())), *words)
-        assert (done.code, "go on?" in done.err) == (0, False)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import re
-import signal
 import time
 from typing import Any
 
 import pytest
 
 from paramclient import ParamType
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
-from paramclient.wire import frames, messages
-from tests.commands import Command, Outcome, Put
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from tests.commands import Command, Put
 
 URL = "sim:custom"
 NAMES = [f"P_{number:02}" for number in range(60)]
@@ -24,20 +22,6 @@ TABLE: dict[str, Any] = dict.fromkeys(NAMES, 1)
 def command(command: Command) -> Command:
     """Run the command line without a cache."""
     return lambda *words: command(*words, "--no-cache")
-
-
-class Interrupting(GenericVehicle):
-    """A vehicle that is interrupted by the user at the 41st set, and sets nothing from then on."""
-
-    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
-        if self.requests["PARAM_SET"] <= 40:
-            super().respond(message, sender)
-        elif isinstance(message, messages.ParamSet) and self.requests["PARAM_SET"] == 41:
-            signal.raise_signal(signal.SIGINT)
-
-
-def statuses(outcome: Outcome) -> dict[str, str]:
-    return {each["name"]: each["status"] for each in outcome.json["results"]}
 
 
 @pytest.mark.parametrize("kind", [PX4Vehicle, ArduPilotVehicle])
@@ -75,20 +59,5 @@ def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> No
     assert vehicle.values["A"] == 6
     as_json = command("set", put(vehicle), *words, "--force", "--json")
     failed = dict.fromkeys(["NO_SUCH", "SMALL", "FIXED"], "refused")
-    assert statuses(as_json) == failed | {"A": "accepted", "COUNT": "adjusted"}
-
-
-@pytest.mark.parametrize("as_json", [False, True])
-def test_ctrl_c_prints_the_outcomes_so_far(command: Command, put: Put, as_json: bool) -> None:
-    vehicle = Interrupting(TABLE)
-    done = command("set", put(Air.symmetric([vehicle], delay=0.02)), *PAIRS, *(["--json"] if as_json else []))
-    assert done.code == 130
-    assert "interrupted: " in done.err
-    assert as_json or re.search(r": \d+ accepted, \d+ unknown$", done.err, re.MULTILINE)
-    found = statuses(done) if as_json else {row[0]: row[-1] for row in done.rows[1:]}
-    assert [*found] == NAMES
-    accepted = [name for name in NAMES if found[name] == "accepted"]
-    assert accepted
-    assert all(vehicle.values[name] == 7 for name in accepted)
-    assert {found[name] for name in NAMES if name not in accepted} == {"unknown"}
-    assert command("set", put(GenericVehicle(TABLE)), *PAIRS).code == 0
+    found = {each["name"]: each["status"] for each in as_json.json["results"]}
+    assert found == failed | {"A": "accepted", "COUNT": "adjusted"}

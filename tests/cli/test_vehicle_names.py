@@ -102,11 +102,6 @@ def test_a_system_id_means_the_vehicle_with_the_autopilot_and_not_its_camera() -
         find_vehicle([camera, replace(camera, key="uid:ca3e0004")], "3", place="here")
 
 
-def test_an_empty_cache_is_reported() -> None:
-    with pytest.raises(UnknownVehicle, match=r"vehicle 4 is not in the cache here.* holds no vehicle\."):
-        find_vehicle([], "4", place="here")
-
-
 # All subcommands that take a vehicle in the cache
 
 

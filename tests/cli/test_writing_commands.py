@@ -128,15 +128,6 @@ def test_only_the_named_vehicle_is_written_to(
 
 
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING])
-def test_the_only_vehicle_need_not_be_named(command: Command, put: Put, words: Words, name: str) -> None:
-    one = px4()
-    put(Tap(Air([one])))  # the number of vehicles is not known
-    done = command(*words(name))
-    assert done.code == 0, done.err
-    assert untouched(one) == (name == "signing disable")
-
-
-@pytest.mark.parametrize("name", [*WRITING, *SIGNING])
 @pytest.mark.parametrize("first", [0.0, 0.9])
 def test_component_chooses_between_two_autopilots_of_a_system(
     command: Command, put: Put, words: Words, name: str, first: float
@@ -219,14 +210,6 @@ def test_values_of_an_ambiguous_source_are_not_used(
 
 
 # All vehicles
-
-
-@pytest.mark.parametrize("name", ["apply", "apply from the cache"])
-def test_all_writes_to_every_vehicle(command: Command, put: Put, words: Words, name: str) -> None:
-    one, two = px4(), copter()
-    put(Air([one, Late(two, 0.9)]))
-    assert command(*words(name), "--vehicle", "all").code == 0
-    assert one.values["MC_ROLL_P"] == two.values["MC_ROLL_P"] == 7
 
 
 # time

@@ -165,25 +165,6 @@ async def test_a_value_that_is_not_reported_any_more_is_unproven() -> None:
     assert not result.complete
 
 
-async def test_an_unknown_name_or_an_invalid_value_refuses_all_unless_partial() -> None:
-    tap = Tap(ardupilot())
-    wrong = {"TUNE_X1": 1, "a name too long!!": 1, "SMALL": 300, "TUNE_03": 2**24 + 1}
-    async with a_client(tap) as client:
-        component = await client.component()
-        with pytest.raises(InvalidParameters, match=r"TUNE_X1: not on this vehicle \(did you mean TUNE_10"):
-            await apply(component, {"TUNE_01": 7, "TUNE_X1": 1})
-        with pytest.raises(InvalidParameters) as caught:
-            await apply(component, {"TUNE_01": 7, **wrong})
-        assert set(caught.value.problems) == set(wrong)
-        assert sets(tap) == []
-        result = await apply(component, {"TUNE_01": 7, **wrong}, partial=True)
-    assert statuses(result) == {"TUNE_01": "accepted", **dict.fromkeys(wrong, "skipped")}
-    assert result.rows["TUNE_X1"].nearest == ("TUNE_10", "TUNE_11", "TUNE_12")
-    assert "cannot be sent exactly" in result.rows["TUNE_03"].reason
-    assert sets(tap) == ["TUNE_01"]
-    assert not result.complete
-
-
 async def test_a_refused_or_adjusted_value_does_not_stop_the_others() -> None:
     vehicle = ardupilot(ClampingVehicle, read_only=["TUNE_02", "TUNE_04"], param_error=True)
     async with a_client(vehicle) as client:
@@ -225,24 +206,6 @@ async def test_the_state_is_stored_before_anything_is_sent(
         name: param.value for name, param in ardupilot().params.items()
     }
     assert dict(first.before) == dict(state)
-
-
-@pytest.mark.parametrize("call", [apply, restore])
-async def test_before_writing_may_end_the_call(call: Callable[..., Any], tmp_path: Path) -> None:
-    cache, tap = ParamCache(tmp_path / "cache.sqlite3"), Tap(ardupilot())
-
-    async def stop() -> None:
-        assert len(component.params) > len(SETTINGS), "it has been read"
-        raise UsageError("not now")
-
-    async with ParamClient(tap, cache=cache) as client:
-        component = await client.component()
-        with pytest.raises(UsageError, match="not now"):
-            await call(component, WANTED, before_writing=stop)
-        assert sets(tap) == []
-        key = component.identity.key
-        await anyio.sleep(1.0)
-    assert cache.snapshots(key) == []
 
 
 async def test_a_silent_vehicle_ends_the_run_and_the_next_run_continues() -> None:
@@ -373,23 +336,6 @@ async def test_several_vehicles_are_set_and_restored_concurrently() -> None:
         before = {system: result.before for (system, _), result in done.results.items()}
         restored = await for_each(components[:2], lambda each: restore(each, before[each.system]))
         assert (restored.complete, values()) == (True, [0.5, 0.5, 0.5])
-
-
-@EVERY_KIND
-async def test_an_armed_vehicle_is_refused_unless_allowed(make: Callable[..., Vehicle]) -> None:
-    tap = Tap(make(armed=True))
-    async with a_client(tap) as client:
-        component = await client.component()
-        with pytest.raises(VehicleArmed, match="1/1 is armed"):
-            await apply(component, WANTED)
-        assert sets(tap) == []
-        assert (await plan(component, WANTED)).to_write
-        assert (await apply(component, some("TUNE_01"), allow_armed=True)).complete
-        # an armed vehicle refuses to reboot, which ends the run
-        result = await apply(component, {"FRAME_CLASS": 2}, allow_armed=True, reboot=True)
-        if make is ardupilot:
-            assert isinstance(result.error, VehicleArmed)
-            assert statuses(result) == {"FRAME_CLASS": "accepted"}
 
 
 async def test_a_vehicle_armed_during_the_run_ends_it() -> None:

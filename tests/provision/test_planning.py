@@ -218,14 +218,6 @@ def test_a_value_that_the_autopilot_cannot_store_must_be_forced(
     assert plan_from(held(P=math.nan), written(P=math.nan), autopilot="px4").complete
 
 
-def test_values_without_metadata_are_counted() -> None:
-    table, wanted = held(A=1, B=1, C=1, D=1), written(A=2, B=2, C=2, D=1)
-    made = plan_from(table, wanted, info={"B": Info(maximum=9)})
-    assert made.unchecked == ("A", "C")
-    assert made.unchecked_note == "ranges not checked: 2 of 3 have no metadata"
-    assert plan_from(table, wanted, info={name: Info() for name in "ABC"}).unchecked_note == ""
-
-
 def test_metadata_marks_read_only_and_reboot_parameters() -> None:
     info = {"A": Info(is_read_only=True), "B": Info(reboot_required=True)}
     made = plan_from(held(A=1, B=1, C=1), written(A=2, B=2, C=2), info=info)
@@ -300,12 +292,6 @@ def test_a_plan_for_the_saved_table_of_a_vehicle_has_no_steps() -> None:
         assert everything.complete
         assert {row.category for row in everything.of(ApplyStatus.SKIPPED)} <= {"action"}
         assert everything.counts[ApplyStatus.UNCHANGED] >= len(current) - 4
-
-
-def test_a_file_of_another_component_is_refused() -> None:
-    camera = ParamSet({"A": 1}, component=100, source="cam.params")
-    with pytest.raises(UsageError, match=r"of cam.params are those of component 100, not of component 1"):
-        plan_from(ParamSet(held(A=2), component=1), camera)
 
 
 def test_a_file_of_another_autopilot_is_refused() -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import io
-import logging
 from pathlib import Path
 
 import pytest
 
-from paramclient import FileError, ParamCache, UsageError, VehicleError
+from paramclient import ParamCache
 from paramclient.model.notation import time_text
 from paramclient.provision import resolve
-from paramclient.provision.sources import read_source
 from paramclient.sim import PX4Vehicle
 from tests.shell import a_client
 
@@ -44,27 +42,3 @@ async def test_every_source_becomes_a_set(tmp_path: Path, monkeypatch: pytest.Mo
     (log,) = (each for each in found.values() if each.system == 1)
     assert log.at is not None
     assert time_text(log.at).startswith("2026-11-20")
-
-
-async def test_a_set_that_a_text_does_not_give_is_an_error(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    file = placed(tmp_path / "quad.param", "A,1\nA_NAME_THAT_IS_TOO_LONG,2\n")
-    with caplog.at_level(logging.WARNING, "paramclient"):
-        assert list(await resolve(str(file))) == ["A"]
-    assert "line 2" in caplog.text
-    with ParamCache(tmp_path / "cache.sqlite3") as cache:
-        async with a_client(PX4Vehicle(table={"A": 1, "B": 2}, dead=["B"]), cache=cache) as client:
-            await client.fetch_all()
-        with pytest.raises(VehicleError, match="1 of 2 parameters are in the cache"):
-            await resolve("1", cache=cache)
-        partial = read_source("1", cache=cache, incomplete=True)
-        assert partial is not None
-        assert list(partial.choose()) == ["A"]
-        with pytest.raises(UsageError, match="is not in the cache"):
-            await resolve("7", cache=cache)
-    placed(file, "A;1\n")
-    with pytest.raises(FileError):
-        await resolve(str(file))
-    with pytest.raises(UsageError, match="excludes"):
-        await resolve("1", cache=False)
