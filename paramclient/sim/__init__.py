@@ -26,7 +26,7 @@ The vehicles behave as measured on real ones, with the real timing. The docstrin
 
 from paramclient.sim.air import Air, Endpoint, FaultyLink
 from paramclient.sim.ardupilot import ArduPilotVehicle
-from paramclient.sim.camera import Camera, ExtEntries, camera_table
+from paramclient.sim.camera import Camera
 from paramclient.sim.param_table import SimParam, Table, ardupilot_table, px4_table
 from paramclient.sim.px4 import PX4Vehicle
 from paramclient.sim.vehicle import GenericVehicle, Vehicle
@@ -36,7 +36,6 @@ __all__ = [
     "ArduPilotVehicle",
     "Camera",
     "Endpoint",
-    "ExtEntries",
     "FaultyLink",
     "GenericVehicle",
     "PX4Vehicle",
@@ -44,6 +43,5 @@ __all__ = [
     "Table",
     "Vehicle",
     "ardupilot_table",
-    "camera_table",
     "px4_table",
 ]

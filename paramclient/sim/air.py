@@ -166,7 +166,7 @@ class Air:
     Attributes:
         vehicles: as given.
         uplink, downlink: as given; may be replaced.
-        vehicle_count: the number of vehicles; None if an endpoint does not say its number.
+        vehicle_count: the number of vehicles; infinite if an endpoint does not say its number.
     """
 
     def __init__(
@@ -179,8 +179,7 @@ class Air:
         self.uplink = uplink or FaultyLink()
         self.downlink = downlink or FaultyLink()
         self.vehicles = tuple(vehicles)
-        counts = [getattr(each, "vehicle_count", None) for each in vehicles]
-        self.vehicle_count: int | None = None if None in counts else sum(map(int, filter(None, counts)))
+        self.vehicle_count: float = sum(getattr(each, "vehicle_count", math.inf) for each in vehicles)
         self._out: list[bytes] = []
 
     @classmethod

@@ -7,7 +7,7 @@ import re
 import struct
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -16,7 +16,7 @@ from paramclient.model.values import Encoding, ParamType, bits_of
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.param_pck import PARAM_FILE
 from paramclient.sim.ftp import Address, FileServer
-from paramclient.sim.param_table import Entry, Table, ardupilot_table, as_table, ek2_group
+from paramclient.sim.param_table import Entry, Table, ardupilot_table, as_table, stored_table
 from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
 
@@ -96,9 +96,9 @@ class ArduPilotVehicle(Vehicle):
     uid2: bytes | None = None
     table: Table | None = None
     groups: Mapping[str, Table] | None = None
-    reboot_groups: Iterable[str] = ()
+    reboot_groups: Collection[str] = ()
     read_only: Iterable[str] | None = None
-    live: Iterable[str] = ("STAT_RUNTIME", "BARO1_GND_PRESS")
+    live: Collection[str] = ("BARO1_GND_PRESS", "STAT_RUNTIME")
     live_period: float = 30.0
     period: float = 0.00595
     ftp: bool = True
@@ -109,23 +109,18 @@ class ArduPilotVehicle(Vehicle):
         table = ardupilot_table() if self.table is None else as_table(self.table)
         groups = self.groups
         if groups is None:
-            groups = {"EK2_ENABLE": ek2_group()} if is_built_in else {}
+            groups = {"EK2_ENABLE": stored_table("ardupilot_ek2.csv")} if is_built_in else {}
         members = {switch: as_table(group) for switch, group in groups.items()}
         rows = tuple(each for row in table for each in (row, *members.get(row.name, ())))
         self._in_groups = frozenset(row.name for row in table[_NOT_IN_GROUPS:] if is_built_in)
         self._switch_of = {row.name: switch for switch, group in members.items() for row in group}
-        self._switches = members.keys()
-        self._late_switches = frozenset(self.reboot_groups)
-        self._was_on = {row.name for row in rows if row.bits != 0}
         internal = [row.name for row in rows if _INTERNAL.fullmatch(row.name)]
         self._read_only = frozenset(internal if self.read_only is None else self.read_only)
-        self._live = frozenset(self.live)
-        uid2 = (int.from_bytes(_UID2, "little") + self.system - 1).to_bytes(18, "little")
-        uid2 = uid2 if self.uid2 is None else self.uid2.ljust(18, b"\0")
+        uid2 = self.uid2 or (int.from_bytes(_UID2, "little") + self.system - 1).to_bytes(18, "little")
         self._stored: set[Entry] = set()
         """Parameters that have had another value than at the first start."""
         self._list_fills_loop = self.burst > _BUSY_RATE * self.period
-        kind, state, _ = _KINDS[self.kind]
+        kind, state, self._state_after_reboot = _KINDS[self.kind]
         self._set_up_table(
             rows,
             messages.Heartbeat(kind, messages.MAV_AUTOPILOT_ARDUPILOTMEGA, 81, system_status=state),
@@ -145,11 +140,11 @@ class ArduPilotVehicle(Vehicle):
         self._ready: list[messages.ParamValue] = []
         self._answers: dict[Entry, ParamType | None] = {}
         """Parameters whose sets are not yet answered, with the type of the answer where it is another one."""
-        self._list_count = 0
         self._has_answered_in_list = False
         self._list_pause_at = math.inf
         self._backlog: deque[frames.Frame] = deque()
         self._file_answers: list[tuple[Packet, Address]] = []
+        self._was_on = {entry.name for entry in self.entries if entry.bits != 0}
         super()._switch_on(at)
         if not self._is_first_run:
             self._due[self._measure] = at + self._clock_delay
@@ -157,25 +152,15 @@ class ArduPilotVehicle(Vehicle):
             self._due[self._change_live] = at + self.live_period
 
     def _tasks(self) -> list[Callable[[float], None]]:
-        first = [self._change_system_id, self._measure, self._change_live, self._end_look_up]
+        first = [self._take_system_id, self._measure, self._change_live, self._end_look_up]
         return [*first, self._send_reads, *super()._tasks(), self._open_window, self._answer_sets]
 
-    def _next(self, period: float, *, after: float | None = None) -> float:
-        """Return the start of the next period; periods are counted from switching on."""
-        if after is None:
-            after = self._now
-        if after < self._on_at:
+    def _next(self, period: float, pause: float = 0.0) -> float:
+        """Return the start of the next period after a pause; periods are counted from switching on."""
+        if self._now < self._on_at:
             return self._on_at
-        turns = (after - self._on_at) / period
+        turns = (self._now + pause - self._on_at) / period
         return self._on_at + (math.floor(turns + _ROUNDING) + 1) * period
-
-    def _end_all(self) -> None:
-        super()._end_all()
-        self._was_on = {entry.name for entry in self.entries if entry.bits != 0}
-        self._take_system_id()
-
-    def _state_after_reboot(self) -> tuple[int, float]:
-        return _KINDS[self.kind][2]
 
     def _send_clock(self, now: float) -> None:
         if self.kind != "copter" and now >= self._on_at + self._clock_delay:
@@ -192,17 +177,12 @@ class ArduPilotVehicle(Vehicle):
 
     def _change_live(self, at: float) -> None:
         self._due[self._change_live] = self._again(at, self.live_period)
-        for entry in self.entries:
-            if entry.name in self._live:
-                value = entry.value
-                if isinstance(value, int) and isinstance(entry.type, ParamType):
-                    later = value + max(1, int(self.live_period))
-                    self._write(entry, bits_of(later if later <= entry.type.bounds[1] else 0, entry.type))
-                else:
-                    self._write(entry, entry.bits ^ 1)
-
-    def _change_system_id(self, at: float) -> None:
-        self._take_system_id()
+        for entry in filter(None, map(self._find, self.live)):
+            if isinstance(entry.value, int):
+                later = entry.bits + max(1, int(self.live_period))
+                self._write(entry, later % (1 << 8 * ParamType(entry.type).size))
+            else:
+                self._write(entry, entry.bits ^ 1)
 
     # Groups
 
@@ -211,7 +191,7 @@ class ArduPilotVehicle(Vehicle):
 
     def _is_listed(self, entry: Entry) -> bool:
         switch = self._switch_of.get(entry.name)
-        if switch in self._late_switches:
+        if switch in self.reboot_groups:
             return switch in self._was_on
         return switch is None or self._entry(switch).bits != 0
 
@@ -229,16 +209,10 @@ class ArduPilotVehicle(Vehicle):
             self.send(messages.StatusText(_WARNING, f"Param write denied ({entry.name})"))
             self._refuse(ParamErrorCode.READ_ONLY, request, sender)
         else:
-            bits = _converted(value, entry.type)
-            is_untyped = bits == entry.bits and self._was_never_stored(entry)
-            self._write(entry, bits)
-            if is_untyped:
+            self._write(entry, _converted(value, entry.type))
+            has_default = entry.packed is not None and entry.packed.default is None
+            if has_default and entry.name in self._in_groups and entry not in self._stored:
                 self._answers[entry] = ParamType.REAL32
-
-    def _was_never_stored(self, entry: Entry) -> bool:
-        """Return whether a parameter of a group has its default and has never had another value."""
-        has_default = entry.packed is not None and entry.packed.default is None
-        return has_default and entry.name in self._in_groups and entry not in self._stored
 
     def _write(self, entry: Entry, bits: int) -> None:
         super()._write(entry, bits)
@@ -249,10 +223,10 @@ class ArduPilotVehicle(Vehicle):
         if bits != entry.bits:
             self._stored.add(entry)
         super()._store(entry, bits)
-        if entry.name in self._switches:
+        if entry.name in self._switch_of.values():
             self._relist()
         if entry.name == self._system_id and self.kind != "copter":
-            self._due[self._change_system_id] = self._next(1.0)
+            self._due[self._take_system_id] = self._next(1.0)
 
     def _answer_sets(self, at: float) -> None:
         for entry, kind in self._answers.items():
@@ -264,9 +238,7 @@ class ArduPilotVehicle(Vehicle):
     def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
         if len(self._waiting) < _READ_QUEUE:
             self._waiting.append((request, sender))
-            self._look_up()
-            if self._due[self._send_reads] == math.inf:
-                self._due[self._send_reads] = self._next_reads()
+            self._end_look_up(self._now)
 
     def _next_reads(self) -> float:
         """Return when the looked up responses are sent: with the next slot."""
@@ -315,7 +287,7 @@ class ArduPilotVehicle(Vehicle):
     def _take(self, frame: frames.Frame) -> None:
         if not self._is_busy:
             super()._take(frame)
-        elif len(self._backlog) < _BACKLOG:
+        else:
             self._backlog.append(frame)
 
     def _on_list(self) -> None:
@@ -346,9 +318,6 @@ class ArduPilotVehicle(Vehicle):
         last = -1 if self._last_listed is None else self._last_listed.order
         return bisect_right(self._listed, last, key=lambda entry: entry.order)
 
-    def _count_in_list(self) -> int:
-        return self._list_count
-
     def _open_window(self, at: float) -> None:
         """Process the messages received during a run of the list, and decide how the list continues."""
         is_pause_due = self._list_pause_at <= at
@@ -363,7 +332,7 @@ class ArduPilotVehicle(Vehicle):
             self._answer_reads()
             self._due[self._send_reads] = self._next_reads() if is_pause_due else math.inf
             if is_pause_due:
-                self._due[self._send_list] = self._next(_SLOT, after=at + _LIST_PAUSE)
+                self._due[self._send_list] = self._next(_SLOT, _LIST_PAUSE)
         elif self._list_pause_at < math.inf:
             self._due[self._open_window] = self._list_pause_at
             return
@@ -449,8 +418,6 @@ _READS_WITHOUT_PAUSE = 10
 """Reads, waiting for the first time in a list, that do not make it pause."""
 _FILE_QUEUE = 19
 """MAVFTP responses that wait while a list occupies the main loop, in addition to the one in preparation."""
-_BACKLOG = 1000
-"""Received frames that wait for processing."""
 
 
 def _converted(value: float, kind: ParamType | int) -> int:

@@ -23,9 +23,9 @@ from paramclient.sim.param_table import Table, as_table, rows_of, typed
 from paramclient.sim.vehicle import Vehicle
 from paramclient.wire import frames, messages
 
-MAV_TYPE_CAMERA: Final = 30
 CAMERA_COMPONENT: Final = 100
 """MAV_COMP_ID_CAMERA."""
+_HEARTBEAT = messages.Heartbeat(30, messages.MAV_AUTOPILOT_INVALID, system_status=messages.MAV_STATE_ACTIVE)
 
 ExtEntries: TypeAlias = Mapping[str, Value | tuple[ParamType | int, Value]]
 """The extended parameters of a `Camera`: values by name, where an int becomes an INT32, a float a REAL32,
@@ -79,13 +79,9 @@ class Camera(Vehicle):
             name: {encode_ext_value(value, self.ext_param(name).type) for value in values}
             for name, values in self.supported.items()
         }
-        self._at_work: dict[str, tuple[float, bytes]] = {}
-        """Writes that take time: when each ends, and the value that it sets."""
         self._set_up_table(
             as_table(self.plain),
-            messages.Heartbeat(
-                MAV_TYPE_CAMERA, messages.MAV_AUTOPILOT_INVALID, system_status=messages.MAV_STATE_ACTIVE
-            ),
+            _HEARTBEAT,
             messages.AutopilotVersion(8192, uid=0xCA3E_0000 + self.system),
         )
 
@@ -157,14 +153,13 @@ class Camera(Vehicle):
 
     def _on_ext_set(self, known: Param, request: messages.ParamExtSet) -> None:
         name, wanted = known.name, ext_bytes(ext_param(known.name, request.raw, request.param_type))
-        is_change = wanted != ext_bytes(known)
         if name in self._at_work:
             self._send_ack(name, ExtAckResult.IN_PROGRESS)
         elif request.param_type != known.type or name in self.failing:
             self._send_ack(name, ExtAckResult.FAILED)
         elif wanted not in self._supported.get(name, (wanted,)):
             self._send_ack(name, ExtAckResult.VALUE_UNSUPPORTED)
-        elif name in self.slow and is_change:
+        elif name in self.slow and wanted != ext_bytes(known):
             self._at_work[name] = (self._now + self.slow[name], wanted)
             self._sooner(self._end_work, self._now + self.slow[name])
             self._send_ack(name, ExtAckResult.IN_PROGRESS)
@@ -181,10 +176,8 @@ class Camera(Vehicle):
         param = ext_param(name, raw, known.type, known.index)
         if name in self.limits and isinstance(param.value, int | float):
             low, high = self.limits[name]
-            value = type(param.value)(min(max(param.value, low), high))
-            raw = encode_ext_value(value, known.type)
-            param = ext_param(name, raw, known.type, known.index)
-        self._ext[name] = param
+            raw = encode_ext_value(type(param.value)(min(max(param.value, low), high)), known.type)
+        self._ext[name] = ext_param(name, raw, known.type, known.index)
 
     def _send_ext(self, *params: Param | None) -> None:
         for each in filter(None, params):
@@ -192,7 +185,8 @@ class Camera(Vehicle):
             self.send(messages.ParamExtValue(each.name, data, each.type, len(self._ext), index))
 
     def _switch_on(self, at: float) -> None:
-        self._at_work.clear()
+        self._at_work: dict[str, tuple[float, bytes]] = {}
+        """Writes that take time: when each ends, and the value that it sets."""
         self._ext_position = 0
         super()._switch_on(at)
 

@@ -36,8 +36,16 @@ class Device:
     """Seconds from accepting a reboot command until the vehicle switches off."""
     _armed_result: ClassVar = CommandResult.DENIED
     """MAV_RESULT of a reboot command while armed."""
+    _shutdown_result: ClassVar = CommandResult.UNSUPPORTED
+    """MAV_RESULT of the command with another value than that of a reboot."""
+    _takes_broadcasts: ClassVar = True
+    """Whether requests to system 0 are answered."""
     _clock_delay: ClassVar = 0.0
     """Seconds from the first heartbeat until SYSTEM_TIME is sent, also on request."""
+    _clock_lead: ClassVar = 0.0
+    """Seconds on the boot clock at the first message."""
+    _state_after_reboot = (messages.MAV_STATE_ACTIVE, 0.0)
+    """The MAV_STATE after a reboot, and its duration in seconds."""
 
     system: int = 1
     component: int = 1
@@ -58,9 +66,7 @@ class Device:
         self.version = version
         self.requests: Counter[str] = Counter()
         self._framer = frames.Framer(messages.DECODED_IDS, stream=self.stream)
-        self._sequence = 0
         self._out: list[bytes] = []
-        self._started = False
         self._is_first_run = True
         self._now = -math.inf
         self._take_key(self.signing_key, self.signing_timestamp)
@@ -78,13 +84,10 @@ class Device:
         The values stay, and those that take effect after a reboot do. Without `now`, reboots at the time of
         the last call.
         """
-        if now is None:
-            now = self._now
-        self._started = True
-        self._is_first_run = False
-        self._end_all()
-        self._switch_on(now + down)
-        self.tick(now)
+        if now is not None:
+            self._now = now
+        self._restart(self._now, down)
+        self.tick(self._now)
 
     def receive(self, data: bytes, now: float) -> None:
         """Take received data at the time `now`."""
@@ -96,11 +99,10 @@ class Device:
 
     def tick(self, now: float) -> None:
         """Do all work that is due by `now`."""
-        self._now = now
+        is_first, self._now = self._now == -math.inf, now
         if self._signer is not None:
             self._signer.advance(now)
-        if not self._started:
-            self._started = True
+        if is_first:
             self._switch_on(now)
         self._work(now)
 
@@ -160,23 +162,10 @@ class Device:
 
     # Implemented by subclasses
 
-    def _answers_system(self, target: int) -> bool:
-        return target in (0, self.system)
-
     def _end_all(self) -> None:
         """End all operations on switching off, and apply values that take effect after a reboot."""
         self._out.clear()
         self._framer.flush()
-
-    def _restart_result(self, mode: int) -> CommandResult:
-        """Return the result of MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with this first parameter."""
-        if self.armed:
-            return self._armed_result
-        return CommandResult.ACCEPTED if mode == _REBOOT else CommandResult.UNSUPPORTED
-
-    def _state_after_reboot(self) -> tuple[int, float]:
-        """Return the MAV_STATE after a reboot, and its duration in seconds."""
-        return messages.MAV_STATE_ACTIVE, 0.0
 
     def _send_clock(self, now: float) -> None:
         """Send the message with the time since boot, once a second."""
@@ -184,7 +173,7 @@ class Device:
 
     def _time_boot_ms(self, now: float) -> int:
         """Return the time since switching on in milliseconds, in 32 bits."""
-        return int((now - self._on_at) * 1000.0) & 0xFFFFFFFF
+        return int((now - self._on_at + self._clock_lead) * 1000.0) & 0xFFFFFFFF
 
     # Internal
 
@@ -202,10 +191,10 @@ class Device:
             self._verifier = signing.Verifier(self._signer, policy, most_streams=_STREAMS_MAX)
         self._framer.guard = None if self._verifier is None else self._verifier.accepts
 
-    def _restart(self, at: float) -> None:
-        now = self._now
-        self.reboot(at, down=self.reboot_down)
-        self._now = now
+    def _restart(self, at: float, down: float | None = None) -> None:
+        self._is_first_run = False
+        self._end_all()
+        self._switch_on(at + (self.reboot_down if down is None else down))
 
     def _send_heartbeat(self, at: float) -> None:
         self._due[self._send_heartbeat] = self._again(at, 1.0)
@@ -219,7 +208,7 @@ class Device:
     def _beat(self) -> messages.Heartbeat:
         """The current heartbeat."""
         beat = self._heartbeat
-        state, seconds = self._state_after_reboot()
+        state, seconds = self._state_after_reboot
         if self._now < self._on_at + self.boot_time:
             beat = replace(beat, system_status=messages.MAV_STATE_BOOT)
         elif not self._is_first_run and self._now < self._on_at + seconds:
@@ -248,31 +237,27 @@ class Device:
 
     def _take(self, frame: frames.Frame) -> None:
         message = messages.decode(frame)
-        name = frames.message_name(frame.message_id)
-        if isinstance(message, messages.Heartbeat):
-            self.requests[name] += 1
         system, component = getattr(message, "target_system", -1), getattr(message, "target_component", -1)
-        is_mine = self._answers_system(system) and component in (messages.COMP_ID_ALL, self.component)
-        if message is not None and is_mine:
-            self.requests[name] += 1
+        is_mine = system == self.system or (system == 0 and self._takes_broadcasts)
+        if message is not None and is_mine and component in (messages.COMP_ID_ALL, self.component):
+            self.requests[frames.message_name(frame.message_id)] += 1
             self.respond(message, frame)
 
     def _on_command(self, request: messages.CommandLong, sender: frames.Frame) -> None:
         wanted = request.param1 if request.command == messages.MAV_CMD_REQUEST_MESSAGE else math.nan
         if request.command == messages.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN:
-            result = self._restart_result(int(request.param1))
-            if result == CommandResult.ACCEPTED and request.param1 == _REBOOT:
-                self._sooner(self._restart, self._now + self._restart_delay)
-            self._acknowledge(request, sender, result)
+            if request.param1 != _REBOOT or self.armed:
+                result = self._armed_result if self.armed else self._shutdown_result
+                self._acknowledge(request, sender, result)
+                return
+            self._acknowledge(request, sender)
+            self._sooner(self._restart, self._now + self._restart_delay)
         elif wanted == messages.message_id(messages.SystemTime):
             self._acknowledge(request, sender)
             self._due[self._send_system_time] = max(self._now, self._on_at + self._clock_delay)
         elif wanted == messages.message_id(messages.Heartbeat):
             self._acknowledge(request, sender, message=self._beat)
-        elif (
-            request.command == messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES
-            or wanted == messages.message_id(messages.AutopilotVersion)
-        ):
+        elif wanted == _VERSION or request.command == messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES:
             self._acknowledge(request, sender, message=self.version)
         else:
             self._acknowledge(request, sender, CommandResult.UNSUPPORTED)
@@ -293,6 +278,7 @@ class Device:
 
 _REBOOT = 1
 """Value of the command that reboots the autopilot; other values shut down, or stay in the bootloader."""
+_VERSION = messages.message_id(messages.AutopilotVersion)
 _ATTITUDE = 30
 _LEVEL_FLIGHT = struct.pack("<6f", 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
 _STREAMS_MAX = 16

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, TypeAlias
 
 from paramclient.errors import FileErrorCode
 from paramclient.model.px4_hash import crc32_px4
@@ -47,14 +47,6 @@ class _Refusal(Exception):
         self.offset = offset
 
 
-class _Request(NamedTuple):
-    """A request, and when it is served."""
-
-    at: float
-    packet: Packet
-    address: Address
-
-
 @dataclass(slots=True)
 class _Session:
     number: int
@@ -65,12 +57,10 @@ class _Session:
 
 @dataclass(slots=True)
 class _Burst:
-    """A burst in progress, with the blocks until its end."""
+    """A burst in progress: the request for its next block, and the blocks until its end."""
 
     request: Packet
     sender: Address
-    offset: int
-    sequence: int
     left: float
 
 
@@ -109,7 +99,8 @@ class FileServer:
     is_px4: bool = False
     files: dict[str, bytes] = field(default_factory=dict)
     _session: _Session | None = None
-    _waiting: deque[_Request] = field(default_factory=deque)
+    _waiting: deque[tuple[float, Packet, Address]] = field(default_factory=deque)
+    """The requests, each with the time when it is served."""
     _burst: _Burst | None = None
     _free_at: float = -math.inf
     _answered_at: float = -math.inf
@@ -131,11 +122,11 @@ class FileServer:
         """Queue a request."""
         if len(self._waiting) < QUEUE:
             turn = PX4_TURN if self.is_px4 else LOOP
-            self._waiting.append(_Request(now + turn, Packet.unpack(payload), sender))
+            self._waiting.append((now + turn, Packet.unpack(payload), sender))
 
     def next_deadline(self) -> float:
         """Return the time of the next work, or infinity."""
-        request_at = max(self._waiting[0].at, self._free_at) if self._waiting else math.inf
+        request_at = max(self._waiting[0][0], self._free_at) if self._waiting else math.inf
         return request_at if self._burst is None else self._free_at
 
     def work(self, now: float, packets_max: float = math.inf) -> list[tuple[Packet, Address]]:
@@ -145,9 +136,8 @@ class FileServer:
             if len(out) >= packets_max:
                 self._free_at = now
                 break
-            answer: Packet | None
             burst = self._burst
-            if burst is None or (self.is_px4 and self._waiting and self._waiting[0].at <= due):
+            if burst is None or (self.is_px4 and self._waiting and self._waiting[0][0] <= due):
                 _, request, sender = self._waiting.popleft()
                 answer, rate = self._answer(request, sender, due), 3 * self.rate
             else:
@@ -182,7 +172,11 @@ class FileServer:
                     data = self._read(request.session, request.offset, request.size, now)
                     return answer._replace(data=data, offset=request.offset)
                 case Opcode.BURST_READ_FILE:
-                    self._begin_burst(request, sender, now)
+                    size = DATA_SIZE_MAX if self.is_px4 else request.size or DATA_SIZE_MAX
+                    self._read(request.session, request.offset, size, now)
+                    blocks = PX4_BURST_BLOCKS if self.is_px4 else math.inf
+                    self._burst = _Burst(request._replace(size=size), sender, blocks)
+                    self._free_at = max(self._free_at, now)
                     return None
                 case Opcode.CALC_FILE_CRC32:
                     content = self._content(_text(request.data), CHECKSUM_READ)
@@ -266,31 +260,19 @@ class FileServer:
             raise _Refusal(FileErrorCode.EOF, offset=offset)
         return data
 
-    def _read_block(self, burst: _Burst, now: float) -> bytes:
-        size = DATA_SIZE_MAX if self.is_px4 else burst.request.size or DATA_SIZE_MAX
-        return self._read(burst.request.session, burst.offset, size, now)
-
-    def _begin_burst(self, request: Packet, sender: Address, now: float) -> None:
-        blocks = PX4_BURST_BLOCKS if self.is_px4 else math.inf
-        burst = _Burst(request, sender, request.offset, request.sequence + 1, blocks)
-        self._read_block(burst, now)
-        self._burst = burst
-        self._free_at = max(self._free_at, now)
-
     def _next_block(self, burst: _Burst, now: float) -> Packet:
-        request = burst.request
-        block = Packet(burst.sequence & 0xFFFF, request.session, Opcode.ACK, requested=request.opcode)
-        burst.sequence += 1
+        request, sequence = burst.request, burst.request.sequence + 1 & 0xFFFF
+        block = Packet(sequence, request.session, Opcode.ACK, requested=request.opcode)
         burst.left -= 1
         try:
-            block = block._replace(data=self._read_block(burst, now), offset=burst.offset)
-            block = block._replace(burst_complete=burst.left == 0)
+            data = self._read(request.session, request.offset, request.size, now)
         except _Refusal as refusal:
-            block = block._replace(opcode=Opcode.NAK, data=refusal.data, offset=refusal.offset)
-        burst.offset += len(block.data)
-        if block.burst_complete or block.opcode == Opcode.NAK:
             self._burst = None
-        return block
+            return block._replace(opcode=Opcode.NAK, data=refusal.data, offset=refusal.offset)
+        burst.request = request._replace(sequence=sequence, offset=request.offset + len(data))
+        if not burst.left:
+            self._burst = None
+        return block._replace(data=data, offset=request.offset, burst_complete=not burst.left)
 
 
 _CLOSING = (Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS)

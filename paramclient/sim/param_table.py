@@ -98,19 +98,13 @@ class Entry:
         """The entry in param.pck, with its default if that differs; None for a type that param.pck lacks."""
         if self._packed is None and self.type in PACKABLE:
             kind, default, other = ParamType(self.type), self.row.default, None
-            if default is not None and not self._is_near(default):
-                whole = int(default) & (1 << 8 * kind.size) - 1
-                other = whole if kind.is_integer else bits_of(default, kind)
+            if default is not None:
+                one, two = struct.unpack("<2f", struct.pack("<2f", float(self.value), default))
+                if not abs(one - two) < FLT_EPSILON:
+                    whole = int(default) & (1 << 8 * kind.size) - 1
+                    other = whole if kind.is_integer else bits_of(default, kind)
             self._packed = PackedParam(self.name, kind, self.bits, other)
         return self._packed
-
-    def _is_near(self, number: float) -> bool:
-        """Return whether the value is this number, as near as ArduPilot compares two float32."""
-        value = self.value
-        if isinstance(value, bytes | str):
-            return False
-        (one,), (two,) = (struct.unpack("<f", struct.pack("<f", each)) for each in (value, number))
-        return bool(abs(one - two) < FLT_EPSILON)
 
     def store(self, bits: int) -> None:
         """Set another value."""
@@ -139,28 +133,14 @@ def typed(entry: Value | tuple[ParamType | int, Value]) -> tuple[ParamType | int
     return ParamType.INT32 if isinstance(entry, SupportsIndex) else ParamType.REAL32, entry
 
 
-@cache
 def px4_table() -> tuple[SimParam, ...]:
     """Return the 903 parameters of a PX4 1.17 quad, read from a real one; 58 of them are volatile."""
-    return _read("px4.csv")
+    return stored_table("px4.csv")
 
 
-@cache
-def third_compass() -> tuple[SimParam, ...]:
-    """Return the parameters of a third compass, not in use on that quad, with the second's values."""
-    return _read("px4_compass.csv")
-
-
-@cache
 def ardupilot_table() -> tuple[SimParam, ...]:
     """Return the 1382 parameters of an ArduCopter 4.6 quad, read from a real one."""
-    return _read("ardupilot.csv")
-
-
-@cache
-def ek2_group() -> tuple[SimParam, ...]:
-    """Return the 52 parameters that EK2_ENABLE shows on that quad. Only their number is measured."""
-    return _read("ardupilot_ek2.csv")
+    return stored_table("ardupilot.csv")
 
 
 def check_range(low: float, high: float = sys.float_info.max, /, **numbers: float) -> None:
@@ -177,7 +157,13 @@ def rows_of(name: str) -> Iterable[dict[str, str]]:
     return csv.DictReader(text.splitlines())
 
 
-def _read(name: str) -> tuple[SimParam, ...]:
+@cache
+def stored_table(name: str) -> tuple[SimParam, ...]:
+    """Return a stored table of plain parameters.
+
+    Besides the two quads': `px4_compass.csv`, those of a third compass, not in use on that quad, with the
+    second's values; `ardupilot_ek2.csv`, the 52 that EK2_ENABLE shows. Only their number is measured.
+    """
     rows = []
     for row in rows_of(name):
         kind = ParamType[row["type"]]

@@ -16,7 +16,7 @@ from paramclient.errors import CommandResult
 from paramclient.model.px4_hash import crc32_px4, hash_bits
 from paramclient.model.values import ParamType, bits_of
 from paramclient.sim.ftp import FileServer
-from paramclient.sim.param_table import Entry, SimParam, Table, as_table, px4_table, third_compass
+from paramclient.sim.param_table import Entry, SimParam, Table, as_table, px4_table, stored_table
 from paramclient.sim.vehicle import SIMULATED_COMMIT, Vehicle
 from paramclient.wire import frames, messages
 
@@ -103,9 +103,13 @@ class PX4Vehicle(Vehicle):
     """
 
     _ack_first: ClassVar = False
+    _takes_broadcasts: ClassVar = False
+    _shutdown_result: ClassVar = CommandResult.DENIED
     _restart_delay: ClassVar = 0.4
     _system_id: ClassVar = "MAV_SYS_ID"
     _reports_wrong_type: ClassVar = False
+    _state_after_reboot = (0, 3.0)  # MAV_STATE_UNINIT
+    _clock_lead: ClassVar = 0.3
 
     table: Table | None = None
     uid: int | None = None
@@ -125,11 +129,11 @@ class PX4Vehicle(Vehicle):
         is_built_in = self.table is None
         rows = px4_table() if self.table is None else as_table(self.table)
         content = repr([(row.name, int(row.type), row.bits) for row in rows]).encode()
+        # metadata is stored by commit
         own = SIMULATED_COMMIT if is_built_in else f"{zlib.crc32(content):08x}"
-        commit = SIMULATED_COMMIT + own  # metadata is stored by commit
-        late_use = self.late_use or {}
-        if is_built_in and self.late_use is None:
-            compass = third_compass()
+        late_use = self.late_use
+        if late_use is None:
+            compass = stored_table("px4_compass.csv") if is_built_in else ()
             late_use = {"CAL_MAG2_ID": [row.name for row in compass]}
             rows += compass
         self._late_use = {name: frozenset(more) for name, more in late_use.items()}
@@ -138,14 +142,13 @@ class PX4Vehicle(Vehicle):
         files = FileServer(self._packed_params if self.ftp else lambda: None, self.ftp_rate, is_px4=True)
         if self.metadata:
             files.files |= metadata_files(rows)
-        self._hash: int | None = None
         self._set_up_table(
             sorted(rows, key=lambda row: row.name),
             _HEARTBEAT,
             messages.AutopilotVersion(
                 59647,
                 flight_sw_version=_MAIN if self.ftp else _RELEASE,
-                git_hash=bytes.fromhex(commit)[::-1],
+                git_hash=bytes.fromhex(SIMULATED_COMMIT + own)[::-1],
                 board_version=1,
                 uid=_UID + self.system - 1 if self.uid is None else self.uid,
             ),
@@ -157,9 +160,7 @@ class PX4Vehicle(Vehicle):
         switch = self._find("MAV_HASH_CHK_EN")
         if not self.hash_check or (switch is not None and switch.bits == 0):
             return None
-        if self._hash is None:
-            self._hash = hash_bits({each.name: each.bits for each in self._listed if not each.row.volatile})
-        return self._hash
+        return hash_bits({each.name: each.bits for each in self._listed if not each.row.volatile})
 
     def use(self, *names: str) -> None:
         """Mark parameters as in use: they join the list, and indices shift.
@@ -173,12 +174,8 @@ class PX4Vehicle(Vehicle):
     def _store(self, entry: Entry, bits: int) -> None:
         super()._store(entry, bits)
         self._unsaved.discard(entry)
-        self._hash = None
 
     # Requests
-
-    def _answers_system(self, target: int) -> bool:
-        return target == self.system
 
     def _on_list(self) -> None:
         is_running = self._position is not None
@@ -198,11 +195,6 @@ class PX4Vehicle(Vehicle):
             self._acknowledge(request, sender, message=metadata)
         else:
             super()._on_command(request, sender)
-
-    def _restart_result(self, mode: int) -> CommandResult:
-        if mode == 0:
-            return CommandResult.ACCEPTED  # without any effect
-        return super()._restart_result(mode) if mode == 1 else CommandResult.DENIED
 
     def _on_read(self, request: messages.ParamRequestRead, sender: frames.Frame) -> None:
         if request.param_index < 0 and request.param_id == messages.HASH_CHECK:
@@ -233,10 +225,6 @@ class PX4Vehicle(Vehicle):
             self._sooner(self._push, self._now + _PUSH_DELAY)
         self._sooner(self._save, max(self._now + self.autosave, self._save_from))
 
-    def _relist(self) -> None:
-        super()._relist()
-        self._hash = None
-
     def _is_listed(self, entry: Entry) -> bool:
         return entry.name not in self._unused
 
@@ -247,11 +235,8 @@ class PX4Vehicle(Vehicle):
         if autoconfig is not None and autoconfig.bits != 0:
             for entry in self.entries:
                 if not entry.name.startswith(RESET_KEEPS):
-                    entry.store(entry.row.bits)
+                    entry.store(1 if entry.name == self._system_id else entry.row.bits)
             autoconfig.store(0)
-            if (system := self._find(self._system_id)) is not None:
-                system.store(1)
-        self._take_system_id()
 
     def _switch_on(self, at: float) -> None:
         self._unused = set(self._never_used)
@@ -275,8 +260,7 @@ class PX4Vehicle(Vehicle):
                 self._write(entry, bits_of(nearer(entry.value, bound), entry.type))
 
     def _wake(self, at: float) -> None:
-        if self._waking & self._unused:
-            self.use(*self._waking)
+        self.use(*self._waking)
 
     def _push(self, at: float) -> None:
         self._push_from = 0
@@ -288,17 +272,11 @@ class PX4Vehicle(Vehicle):
 
     # Sending
 
-    def _state_after_reboot(self) -> tuple[int, float]:
-        return _UNINIT, 3.0
-
     def _send_clock(self, now: float) -> None:
         self._send_attitude()
 
     def _send_system_time(self, at: float) -> None:
         """Send nothing: the clock is never set."""
-
-    def _time_boot_ms(self, now: float) -> int:
-        return super()._time_boot_ms(now + _CLOCK_LEAD)
 
     def _send_next(self) -> bool:
         if self._hash_next:
@@ -309,13 +287,12 @@ class PX4Vehicle(Vehicle):
 
     def _push_next(self) -> bool:
         """Send the next unsaved parameter; return False if there is none."""
-        if self._push_from is not None:
-            for index in range(self._push_from, len(self._listed)):
-                if self._listed[index] in self._unsaved:
-                    self._push_from = index + 1
-                    self._send_value(self._listed[index])
-                    return True
-        self._push_from = None
+        start, self._push_from = self._push_from, None
+        for index in range(len(self._listed) if start is None else start, len(self._listed)):
+            if self._listed[index] in self._unsaved:
+                self._push_from = index + 1
+                self._send_value(self._listed[index])
+                return True
         return False
 
     def _send_hash(self) -> None:
@@ -328,15 +305,12 @@ class PX4Vehicle(Vehicle):
 _LIMITED = frozenset(name for limit in LIMITS for name in limit if isinstance(name, str))
 _FIRST_START_ONLY = frozenset({"CAL_BARO1_ID", "CAL_BARO2_ID", "CAL_BARO3_ID"})
 _METADATA = messages.message_id(messages.ComponentMetadata)
-_UNINIT = 0
 _HEARTBEAT = messages.Heartbeat(2, messages.MAV_AUTOPILOT_PX4, 29, 50593792, system_status=3)
 """A quadrotor on standby."""
 _RELEASE = 17891392
 """flight_sw_version of 1.17.0."""
 _MAIN = 0x01120000
 """flight_sw_version of 1.18."""
-_CLOCK_LEAD = 0.3
-"""Seconds on the boot clock at the first message."""
 _UID = 5283920058631409231
 _PUSH_DELAY = 0.010
 """Seconds from a change until it is sent again."""

@@ -219,10 +219,6 @@ class Vehicle(Device):
         """Return the index among the listed parameters for a position of the list in progress."""
         return position
 
-    def _count_in_list(self) -> int:
-        """Return the param_count of the list's values."""
-        return len(self._listed)
-
     # The list and the files
 
     def _switch_on(self, at: float) -> None:
@@ -230,6 +226,9 @@ class Vehicle(Device):
         """The next index of the list, None while no list is being sent."""
         self._last_listed: Entry | None = None
         self._list_sent = 0
+        self._list_count: int | None = None
+        """The param_count of the list's values; None for the current one."""
+        self._take_system_id(at)
         if self.file_server is not None:
             self.file_server.reset()
         self._relist()
@@ -259,7 +258,6 @@ class Vehicle(Device):
 
     def _send_next(self) -> bool:
         """Send the next item of the list; return False if there is none."""
-        self._call_when_listed()
         if self._position is None:
             return False
         index = self._position
@@ -270,14 +268,11 @@ class Vehicle(Device):
         entry = self._last_listed = self._listed[place]
         self._position = index + 1 if place + 1 < len(self._listed) else None
         if not self._is_dead(entry):
-            self._send_value(entry, index=index, count=self._count_in_list())
+            self._send_value(entry, index=index, count=self._list_count)
             self._list_sent += 1
-            self._call_when_listed()
+            for do in self._when_listed.pop(self._list_sent, ()):
+                do()
         return True
-
-    def _call_when_listed(self) -> None:
-        for do in self._when_listed.pop(self._list_sent, ()):
-            do()
 
     def _serve_files(self, at: float) -> None:
         """Send the due MAVFTP responses."""
@@ -293,7 +288,7 @@ class Vehicle(Device):
         packed = [each for entry in self._listed if (each := entry.packed) is not None]
         return packed if len(packed) == len(self._listed) else None
 
-    def _take_system_id(self) -> None:
+    def _take_system_id(self, at: float) -> None:
         """Use the system id in the parameter, if the parameter exists and its value is a valid id."""
         entry = self._find(self._system_id)
         if entry is not None and isinstance(entry.value, int) and 1 <= entry.value <= 255:
@@ -330,11 +325,8 @@ class Vehicle(Device):
         """Send a PARAM_VALUE with the entry's index and type and the list's count, or the given ones."""
         if index is None:
             index = messages.NO_INDEX if entry.index is None else entry.index
-        if count is None:
-            count = len(self._listed)
-        self.send(
-            messages.ParamValue(entry.name, entry.raw, entry.type if kind is None else kind, count, index)
-        )
+        count = count or len(self._listed)
+        self.send(messages.ParamValue(entry.name, entry.raw, kind or entry.type, count, index))
 
     def _refuse(
         self,
