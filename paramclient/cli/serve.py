@@ -16,7 +16,6 @@ from paramclient.client.signing import read_key, timestamp_now
 from paramclient.errors import UsageError
 from paramclient.links import LinkKind, create_link, parse_link, serve_endpoint
 from paramclient.links.sim import simulated
-from paramclient.links.sockets import TcpIn, UdpIn
 from paramclient.protocol.channel import task_group
 
 SERVICE_LIBRARIES: Final = ("fastapi", "uvicorn")
@@ -139,6 +138,6 @@ async def sim(
     async with task_group() as tasks:
         opened = await tasks.start(serve_endpoint, simulated(kind, **options).endpoint, real)
         where = f"speaks to {spec}"
-        if isinstance(opened, UdpIn | TcpIn) and opened.address is not None:
+        if spec.kind in (LinkKind.UDPIN, LinkKind.TCPIN):
             where = f"listens on {replace(spec, port=opened.address[1])}"
         print_line(f"{vehicle} {where}; Ctrl-C ends it")

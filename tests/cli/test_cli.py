@@ -126,6 +126,11 @@ def simulated(vehicle: str) -> Iterator[str]:
         yield f"udpout:127.0.0.1:{found[1]}"
 
 
+def test_a_simulated_vehicle_that_sends_names_its_target() -> None:
+    with process("sim", "px4", "--link", "udpout:127.0.0.1:14999") as started:
+        assert line_of(started.stdout) == "px4 speaks to udpout:127.0.0.1:14999; Ctrl-C ends it\n"
+
+
 # fetch
 
 
