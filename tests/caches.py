@@ -15,7 +15,6 @@ from typing import Any
 import paramclient
 from paramclient.cache import (
     BY_VEHICLE,
-    HistoryEntry,
     ParamCache,
     StoredParam,
     TableState,
@@ -94,12 +93,6 @@ def values(cache: ParamCache, identity: Identity = PX4, component: int = 1) -> d
     """The values of one table; none where there is no table."""
     found = cache.load(identity.key, component)
     return {} if found is None else {name: param.value for name, param in found.params.items()}
-
-
-def changes(cache: ParamCache, name: str | None = None) -> list[HistoryEntry]:
-    """The history of the only table, or of one of its parameters."""
-    table = cache.component()
-    return cache.history(table.key, table.component, name)
 
 
 def rubbish(size: int, seed: int = 1) -> bytes:

@@ -25,9 +25,8 @@ from paramclient.client import component as component_module
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import ParamType
 from paramclient.provision import apply
-from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, SimParam
+from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, PX4Vehicle, SimParam
 from paramclient.wire import frames, messages
-from tests.caches import changes as history_of
 from tests.caches import read_only
 from tests.client.conftest import connected, fetched, table_in
 from tests.conversations.virtual import Tap as Filter
@@ -61,10 +60,11 @@ def kept(path: Path, system: int = 1) -> dict[str, int]:
     return bits(table_in(path, system=system).params)
 
 
-def history(path: Path, name: str | None = None) -> list[tuple[str, Any, Any, str]]:
+def history(path: Path, name: str | None = None, **which: Any) -> list[tuple[str, Any, Any, str]]:
     """The lines of the history of the only vehicle, or of one of its parameters: before, after, author."""
     with ParamCache(path) as cache:
-        lines = history_of(cache, name)
+        [vehicle] = cache.vehicles()
+        lines = cache.history(vehicle.key, name=name, **which)
         # digits below would be rounded up: no change is printed with a later time than it is kept with
         assert [line.at for line in lines] == [round(line.at, 6) for line in lines]
         return [(line.name, line.old.value, line.new and line.new.value, line.by) for line in lines]
@@ -519,3 +519,68 @@ def test_two_programs_share_vehicles_and_a_cache(tmp_path: Path) -> None:
                 steps = [(line.old.value, line.new and line.new.value) for line in lines]
                 assert (steps[0][0], steps[-1][1]) == (before, after)
                 assert all(one[1] == two[0] for one, two in itertools.pairwise(steps)), "nothing stands twice"
+
+
+# extended parameters
+
+TABLE: dict[str, int | float | str | bytes] = {"CAM_MODE": 1, "CAM_NAME": "Front", "CAM_ISO": 100}
+
+
+def kept_of_camera(path: Path) -> dict[str, object]:
+    params = table_in(path, component=100, extended=True).params
+    return {name: param.value for name, param in params.items()}
+
+
+async def test_the_next_session_knows_extended_parameters(tmp_path: Path) -> None:
+    path = tmp_path / "cache"
+    camera = Camera(TABLE)
+    async with ParamClient(camera, cache=path) as client:
+        ext = (await client.component(1, 100)).ext
+        assert isinstance(ext, Component)
+        assert (await ext.fetch_all()).complete
+        assert (await ext.set("CAM_NAME", "Rear", author="anna")).actual == "Rear"
+    assert kept_of_camera(path) == TABLE | {"CAM_NAME": "Rear"}
+    camera.set_ext_param("CAM_ISO", 400)
+    camera.remove_ext_param("CAM_MODE")
+    async with ParamClient(camera, cache=path) as client:
+        ext = (await client.component(1, 100)).ext
+        assert {name: param.value for name, param in ext.params.items()} == TABLE | {"CAM_NAME": "Rear"}
+        assert {param.trust for param in ext.params.values()} == {Trust.CACHED}
+        changes = ext.changes()
+        assert (await ext.fetch_all()).complete
+        reported = {(each.name, each.kind) for each in [await anext(changes), await anext(changes)]}
+        assert reported == {("CAM_ISO", "changed"), ("CAM_MODE", "removed")}
+    assert kept_of_camera(path) == {"CAM_NAME": "Rear", "CAM_ISO": 400}
+    assert sorted(history(path, component=100, extended=True)) == [
+        ("CAM_ISO", 100, 400, "vehicle"),
+        ("CAM_MODE", 1, None, "vehicle"),
+        ("CAM_NAME", "Front", "Rear", "us for anna"),
+    ]
+
+
+@pytest.mark.parametrize("is_first", [True, False], ids=["before its autopilot", "after its autopilot"])
+async def test_a_camera_is_cached_with_its_vehicle(tmp_path: Path, is_first: bool) -> None:
+    """A vehicle is its autopilot's hardware id; the camera has another one of its own."""
+    path = tmp_path / "cache"
+    camera, autopilot = Camera(TABLE), small_px4()
+    late = autopilot if is_first else camera
+    for value in (200, 400):
+        late.reboot(anyio.current_time(), down=math.inf)
+        async with ParamClient(Air([camera, autopilot]), cache=path) as client:
+            late.reboot(anyio.current_time(), down=1.0 if is_first else 5.0)
+            found = await client.component(1, 100, timeout=10.0)
+            await client.component(1, 1)
+            await found.wait_for_cache()
+            assert ("CAM_ISO" in found.ext.params) == (value == 400)
+            await found.ext.fetch_all()
+            await found.ext.set("CAM_ISO", value)
+            assert found.identity == client.components[1, 1].identity
+    with ParamCache(path) as cache:
+        [vehicle] = cache.vehicles()
+        assert vehicle.key == client.components[1, 1].identity.key
+        assert 100 in vehicle.components
+        found_lines = cache.history("1", extended=True)
+    assert [(each.name, each.new and each.new.value) for each in found_lines] == [
+        ("CAM_ISO", 200),
+        ("CAM_ISO", 400),
+    ]

@@ -8,15 +8,30 @@ import math
 import os
 import threading
 from collections.abc import Callable, Coroutine
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import anyio
 import anyio.abc
 import pytest
 
-from paramclient import Change, Changes, Component, ParamClient, ParamType, Progress, errors
+from paramclient import (
+    Change,
+    Changes,
+    Component,
+    NoReply,
+    ParamClient,
+    ParamType,
+    Progress,
+    SetOutcome,
+    SetStatus,
+    errors,
+)
 from paramclient.client import link_task
+from paramclient.client.cache_writer import CacheWriter
+from paramclient.model.px4_hash import crc32_px4
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire import messages
 from tests.client.conftest import connected, fetched
@@ -410,3 +425,166 @@ async def test_a_link_that_cannot_reconnect_ends_every_call() -> None:
         assert "closed" in repr(client)
         assert not residue(component)
     assert isinstance(await outcome(component.get("PARAM_01")), errors.ClientClosed)
+
+
+# many writes in one call
+
+MANY: dict[str, int | float] = {f"MANY_{number:03}": float(number) for number in range(200)}
+NEW: dict[str, int | float] = {name: value + 0.5 for name, value in MANY.items()}
+
+
+async def test_each_value_has_an_outcome_of_its_own() -> None:
+    vehicle = ArduPilotVehicle(
+        table={**{name: float(value) for name, value in VALUES.items()}, "COUNT": 3},
+        read_only=["PARAM_03"],
+        live=(),
+        ftp=False,
+        param_error=True,
+    )
+    wanted = {"PARAM_01": 5.0, "NO_SUCH": 1.0, "COUNT": 7.6, "PARAM_03": 9.0, "PARAM_04": float("nan")}
+    seen: list[SetOutcome] = []
+    async with fetched(vehicle) as (_, component):
+        result = await component.set_many({**wanted, "PARAM_05": 6.0}, progress=seen.append)
+        assert {each.name: each.status for each in result.outcomes} == {
+            **dict.fromkeys(("PARAM_01", "PARAM_05"), "accepted"),
+            **dict.fromkeys(("NO_SUCH", "PARAM_03", "PARAM_04"), "refused"),
+            "COUNT": "adjusted",
+        }
+        for name, kind in (
+            ("NO_SUCH", errors.UnknownParameter),
+            ("PARAM_03", errors.Refused),
+            ("PARAM_04", errors.UsageError),
+        ):
+            assert isinstance(result[name].error, kind)
+        assert result["COUNT"].requested == 7.6
+        assert result["COUNT"].result is not None
+        assert result["COUNT"].result.actual == vehicle.params["COUNT"].value
+        assert (result.error, result.is_complete) == (None, False)
+        assert sorted(map(str, seen)) == sorted(map(str, result.outcomes))
+        with pytest.raises(KeyError):
+            result["PARAM_02"]
+
+
+async def test_the_timeout_is_that_of_the_whole_call() -> None:
+    tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
+    async with fetched(tap) as (_, component):
+        result = await component.set_many(NEW, timeout=0.25)
+        assert 0.2 < result.elapsed < 0.4
+        assert isinstance(result.error, errors.NoReply)
+        assert result.counts[SetStatus.ACCEPTED] >= 10
+        assert result.counts[SetStatus.UNKNOWN] >= 10
+        assert result.counts[SetStatus.NOT_TRIED] >= 100
+        assert not residue(component)
+        sent = len(tap.messages(messages.ParamSet))
+        await asyncio.sleep(1.0)
+        assert len(tap.messages(messages.ParamSet)) == sent
+        assert (await component.set_many(NEW)).is_complete
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"PARAM_01": 1, "no name": 1}, "no name"),
+        ({"PARAM_01": 1, "PARAM_02": "two"}, "two"),
+        ({"PARAM_01": 1, "_HASH_CHECK": 1}, "read-only"),
+    ],
+)
+async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], message: str) -> None:
+    tap = Tap(small_px4())
+    async with connected(tap) as (_, component):
+        with pytest.raises(errors.UsageError, match=message):
+            await component.set_many(values)
+        with pytest.raises(errors.UsageError, match="settle"):
+            await component.set_many({"PARAM_01": 1}, settle=-1)
+        assert (await component.set_many({})).is_complete
+        await asyncio.sleep(1.0)
+        assert not tap.messages(messages.ParamSet)
+
+
+async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Path) -> None:
+    async with fetched(small_px4(), cache=tmp_path / "cache") as (_, component):
+        assert (await component.set_many({"PARAM_01": 2}, durable=True)).is_complete
+        failing = mock.AsyncMock(side_effect=errors.CacheError("disk I/O error"))
+        with mock.patch.object(CacheWriter, "write_durably", failing):
+            result = await component.set_many({"PARAM_01": 3, "NO_SUCH": 1, "PARAM_02": 4}, durable=True)
+        assert isinstance(result.error, errors.NotDurable)
+        assert isinstance(result["PARAM_02"].error, errors.NotDurable)
+        assert result["PARAM_02"].status is SetStatus.ACCEPTED
+        assert result["PARAM_02"].is_set
+        assert isinstance(result["NO_SUCH"].error, errors.UnknownParameter)
+        assert not result.is_complete
+    with pytest.raises(errors.UsageError, match="durable"):
+        async with a_client(small_px4()) as client:
+            await (await client.component()).set_many({"PARAM_01": 2}, durable=True)
+
+
+# files
+
+LOG = bytes(range(256)) * 200
+"""A file of 51,200 bytes, which takes a second."""
+FILES = {"/APM/LOGS/1.BIN": LOG, "/APM/a.txt": b"hello", "/APM/empty": b""}
+
+
+def with_files(**options: Any) -> ArduPilotVehicle:
+    vehicle = ArduPilotVehicle(live_period=0, **options)
+    vehicle.files.update(FILES)
+    return vehicle
+
+
+async def test_a_time_limit_ends_a_read_and_closes_the_file() -> None:
+    vehicle = with_files()
+    async with connected(vehicle) as (_, component):
+        began = anyio.current_time()
+        with pytest.raises(NoReply, match=r"/APM/LOGS/1.BIN of 1/1"):
+            await component.read_file("/APM/LOGS/1.BIN", timeout=0.3)
+        assert anyio.current_time() - began < 1.41  # the vehicle ends its burst of a second before it closes
+        await anyio.sleep(1.0)
+        assert not vehicle.open_files
+        assert await component.file_checksum("/APM/a.txt") == crc32_px4(b"hello")
+
+
+@pytest.mark.parametrize("how", ["timeout", "error", "task", "all tasks", "scope"])
+async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str) -> None:
+    """All tasks are cancelled, each for itself, by `asyncio.run` when its main task has ended."""
+    requests = 0
+    for step in range(1, 40):
+        vehicle, seconds = ArduPilotVehicle(live_period=0), step / 100
+        air = Air.symmetric([vehicle], delay=0.02)
+
+        async def session(air: Air, seconds: float) -> None:
+            with anyio.move_on_after(seconds if how == "scope" else None) as scope:
+                async with connected(air) as (_, component):
+                    if how == "error":
+                        fetching = asyncio.ensure_future(outcome(component.fetch_all()))
+                        await anyio.sleep(seconds)
+                        assert not fetching.done()
+                        raise RuntimeError("of the body")
+                    with suppress(NoReply):
+                        await component.fetch_all(timeout=seconds if how == "timeout" else None)
+            assert scope.cancelled_caught == (how == "scope")
+
+        task = asyncio.ensure_future(session(air, seconds))
+        if how.endswith(("task", "tasks")):
+            await anyio.sleep(seconds)
+            for each in {task} if how == "task" else asyncio.all_tasks() - {asyncio.current_task()}:
+                each.cancel()
+        with anyio.fail_after(0.5 if how == "all tasks" else 5.0):
+            await asyncio.wait([task])
+        assert task.cancelled() == how.endswith(("task", "tasks"))
+        assert task.cancelled() or bool(task.exception()) == (how == "error")
+        assert not tasks_beside()
+        if how == "all tasks":  # the vehicle ends its burst before it closes
+            await anyio.sleep(1.0)
+            air.tick(anyio.current_time())
+        assert not vehicle.open_files
+        requests += vehicle.requests["FILE_TRANSFER_PROTOCOL"]
+    assert requests > 80
+
+
+async def test_a_read_goes_on_when_the_link_is_back() -> None:
+    link = FlakyLink(with_files())
+    async with connected(link) as (_, component):
+        reading = asyncio.ensure_future(component.read_file("/APM/LOGS/1.BIN"))
+        await anyio.sleep(0.3)
+        await link.drop()
+        assert await reading == LOG

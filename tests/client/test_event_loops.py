@@ -20,7 +20,6 @@ import pytest
 
 from paramclient import ClientClosed, Component, ParamClient, UsageError
 from paramclient.client import core
-from paramclient.errors import LinkError
 from paramclient.links import Link, Peer, SimLink, create_link, serve_endpoint
 from paramclient.sim import Endpoint, Vehicle
 from tests.cable import TIMEOUT
@@ -63,20 +62,6 @@ async def test_a_session_over_sockets(ours: str, theirs: str) -> None:
             await serving.start(serve_endpoint, vehicle, calling)
             await everything(await client.component(), vehicle)
             serving.cancel_scope.cancel()
-
-
-@pytest.mark.parametrize("link", ["udpin", "tcpin", "tcp"])
-async def test_a_link_that_cannot_be_opened(link: str) -> None:
-    """Not even a task remains: the error is raised unchanged, in no group."""
-    taken = create_link("udpin:127.0.0.1:0" if link == "udpin" else "tcpin:127.0.0.1:0")
-    await taken.open()
-    port = port_of(taken)
-    if link == "tcp":
-        await taken.close()
-    with pytest.raises(LinkError, match=r"in use by another link|refused"):
-        async with a_client(f"{link}:127.0.0.1:{port}"):
-            pass
-    await taken.close()
 
 
 @pytest.mark.parametrize("how", ["error", "scope", "cancelled aclose"])

@@ -246,6 +246,17 @@ async def test_integers_of_a_file_are_exact_and_keep_so_beside_rounded_messages(
         assert isinstance(default, int)
 
 
+async def test_a_refused_file_is_not_requested_again_on_the_link() -> None:
+    vehicle = PX4Vehicle(param_error=True)  # claims to have it, and answers: file not found
+    async with talking(vehicle) as (conversation, session):
+        await session.identification.settled()
+        for _ in range(2):
+            result = await fetch_all(session, refresh=True)
+            assert (result.source, bool(result.missing)) == ("stream", False)
+        requests = [each.opcode for each in packets_in(conversation.sent_of(FileTransfer))]
+        assert requests.count(Opcode.OPEN_FILE_RO) <= 1
+
+
 async def test_a_lost_opening_of_the_file_is_repeated_before_the_list_is_taken() -> None:
     def opens(message: Message) -> bool:
         return any(each.opcode == Opcode.OPEN_FILE_RO for each in packets_in([message]))

@@ -16,7 +16,7 @@ from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.identity import judge_encoding
 from paramclient.protocol.presence import BOOT_CLOCK_WRAP, REORDERING_TIME, Presence
 from paramclient.protocol.reads import read
-from paramclient.protocol.selection import find, only_vehicle
+from paramclient.protocol.selection import find, hint_of_link, only_vehicle
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import messages
@@ -312,16 +312,6 @@ async def test_commands_end_with_their_result_and_wait_while_one_is_in_progress(
 # peers
 
 
-async def test_the_same_hardware_id_proves_that_a_vehicle_has_moved() -> None:
-    async with converse(Nothing()) as conversation:
-        conversation.hear(PX4, messages.AutopilotVersion(0, uid=7), peer="a")
-        node = conversation.station.nodes[1, 1]
-        conversation.hear(messages.AutopilotVersion(0, uid=8), peer="b")
-        assert node.peer == "a"
-        conversation.hear(messages.AutopilotVersion(0, uid=7), peer="b")
-        assert (node.peer, node.has_rival(anyio.current_time())) == ("b", False)
-
-
 async def test_a_vehicle_at_another_peer_may_be_another_one_until_it_is_identified() -> None:
     async with converse(Nothing()) as conversation:
         conversation.hear(messages.HighLatency2(2, 12), peer="a")  # it counts as lost only after a minute
@@ -335,6 +325,10 @@ async def test_a_vehicle_at_another_peer_may_be_another_one_until_it_is_identifi
         assert len(conversation.sent_of(messages.CommandLong)) > asked
         conversation.hear(messages.AutopilotVersion(0, uid=8), peer="b")
         assert (node.peer, len(conversation.of("replaced"))) == ("b", 1)
+        conversation.hear(messages.AutopilotVersion(0, uid=9), peer="c")
+        assert node.peer == "b"
+        conversation.hear(messages.AutopilotVersion(0, uid=8), peer="c")  # which proves that it has moved
+        assert (node.peer, node.has_rival(anyio.current_time())) == ("c", False)
 
 
 async def test_split_peers_are_components_of_their_own() -> None:
@@ -363,6 +357,14 @@ async def test_a_whole_session_in_mavlink_1(make: type[Vehicle]) -> None:
         assert {
             data[0] for data in conversation.sent if not isinstance(messages_in(data)[0], messages.Heartbeat)
         } == {0xFE}
+
+
+async def test_hints_tell_a_link_that_is_down_from_one_without_heartbeats() -> None:
+    async with converse(Nothing()) as conversation:
+        conversation.hear(messages.StatusText(6, "x"), system=9)
+        assert "1 MAVLink frame arrived on sim:test" in hint_of_link(conversation.station, 60)
+        conversation.station.interrupt()
+        assert "is down" in hint_of_link(conversation.station, 60)
 
 
 async def test_components_have_a_bound() -> None:

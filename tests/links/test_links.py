@@ -461,6 +461,8 @@ async def test_udpout_receives_only_from_its_target_and_keeps_its_port() -> None
     with udp_socket() as vehicle:
         async with opened(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}") as link:
             address = ("127.0.0.1", link.address[1])
+            async with opened(link.name) as other:
+                assert other.address[1] != link.address[1]
             with udp_socket(address) as stranger:
                 await link.send(frame(1), None)
                 assert vehicle.recvfrom(1000) == (frame(1), address)
