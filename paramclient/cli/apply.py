@@ -39,7 +39,6 @@ _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be reve
 """Words for planned actions in the summary, where they differ from the status."""
 _INCLUDABLE: Final = frozenset(CATEGORIES) - {READ_ONLY}
 """Categories of left-out parameters that --include writes; the vehicle lets no client write the others."""
-_LATE: Final = "takes effect after a reboot"
 _SNAPSHOT: Final = re.compile("[0-9]{1,18}")
 """The number of a snapshot; all other texts are times."""
 _OPTIONS: Final = ApplyFlags()
@@ -245,14 +244,12 @@ async def _defaults(
     if not wanted:
         raise errors.VehicleError(no_defaults(), *session.component.address)
     say_sources(session.label, found.values())
-    gaps = []
-    if missing and any(map(is_pattern, chosen)):
-        gaps.append(f"incomplete: {counted(len(missing), 'parameter')} not received")
-    if (without := [name for name in found if name not in wanted]) and not only_known:
-        gaps.append(f"not written, as their default is not known: {listed(without)}")
-    for gap in gaps:
-        report(f"{session.prefix}{gap}")
-    return State(ParamSet(wanted, source="the firmware's defaults"), is_part=bool(gaps))
+    without = [] if only_known else [name for name in found if name not in wanted]
+    if is_cut := bool(missing) and any(map(is_pattern, chosen)):
+        report(f"{session.prefix}incomplete: {counted(len(missing), 'parameter')} not received")
+    if without:
+        report(f"{session.prefix}not written, as their default is not known: {listed(without)}")
+    return State(ParamSet(wanted, source="the firmware's defaults"), is_part=is_cut or bool(without))
 
 
 # Plans and writes
@@ -320,8 +317,6 @@ async def _run(
                 return code
             if has_work and not await confirm("go on?"):
                 return ExitCode.INCOMPLETE
-        if flags.no_cache and flags.backup is None and not url.startswith("sim:"):
-            say("the state before is not stored: --no-cache is given, and --backup is not")
         return await write_all(found, jobs)
 
 
@@ -372,7 +367,7 @@ class _Job:
             session.announce_write()
 
         self.found = Rows(arrived)
-        title = f"{'restoring' if self.is_restore else 'setting'} {session.label}"
+        title = f"setting {session.label}"
         more = ApplyOptions(timeout=session.deadline.left(), progress=update, before_writing=announce)
         with Status(f"{title}: waiting for the first response", title) as status:
             self.found = await run_apply(
@@ -420,31 +415,28 @@ class _Job:
         found, session, remarks = self.found, self.session, list[str]()
         words = ", ".join(f"{count} {_WORDS.get(status, status)}" for status, count in found.counts.items())
         summary = f"{session.receiver}: {words or 'nothing to set'}"
+        if isinstance(found, Plan):
+            made, end, code, late = found, "; nothing was sent", self._judge(found), found.reboot_for
+            late += found.awaiting_reboot if self.options["reboot"] else ()
+            remarks.append(found.firmware_note)
+        elif isinstance(found, ApplyResult):
+            made, end, late = found.plan, f" in {found.elapsed:.1f} s", found.reboot_required
+            code = ExitCode.DONE if found.complete else ExitCode.INCOMPLETE
+            if found.system != session.component.system:
+                remarks.append(f"the vehicle is {found.system}/{found.component} now")
+        else:  # interrupted
+            say(summary)
+            return ExitCode.DONE
+        say(f"{summary}{end}")
+        remarks.append(made.unchecked_note)
         skipped = [row.category for row in found.of(ApplyStatus.SKIPPED) if row.differs]
         if left_out := Counter(category for category in skipped if category in _INCLUDABLE):
             counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
             options = " ".join(f"--include {category}" for category in left_out)
             remarks.append(f"left out: {counts}; to write them: {options}")
-        if isinstance(found, Plan):
-            say(f"{summary}; nothing was sent")
-            names = found.reboot_for + (found.awaiting_reboot if self.options["reboot"] else ())
-            verb = "reboots for" if self.options["reboot"] else _LATE
-            remarks += [
-                found.unchecked_note,
-                f"{verb}: {listed(names)}" if names else "",
-                found.firmware_note,
-            ]
-            code = self._judge(found)
-        elif isinstance(found, ApplyResult):
-            say(f"{summary} in {found.elapsed:.1f} s")
-            late = found.reboot_required
-            remarks += [found.plan.unchecked_note, f"{_LATE}: {listed(late)}" if late else ""]
-            if found.system != session.component.system:
-                remarks.append(f"the vehicle is {found.system}/{found.component} now")
-            code = ExitCode.DONE if found.complete else ExitCode.INCOMPLETE
-        else:  # interrupted
-            say(summary)
-            return ExitCode.DONE
+        if late:
+            reboots = found is made and self.options["reboot"]
+            remarks.append(f"{'reboots for' if reboots else 'takes effect after a reboot'}: {listed(late)}")
         for remark in filter(None, remarks):
             say(f"{session.label}: {remark}")
         if isinstance(found, ApplyResult) and found.error is not None:

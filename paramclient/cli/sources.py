@@ -34,17 +34,8 @@ from paramclient.model.comparison import ChangedSide, compare
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.paramset import ParamSet, default_of
+from paramclient.provision import sources
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.sources import (
-    choose,
-    collect_defaults,
-    fetched_set,
-    is_file,
-    is_offline,
-    link_of,
-    read_source,
-    select_non_defaults,
-)
 
 _ENDINGS: Final = frozenset({*ENDINGS, ".bin", ".ulg", ".txt", ".csv"})
 """Extensions of files with parameters, also of formats that are not readable: a text with one of them is
@@ -81,9 +72,9 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: boo
     if ChosenVehicle.parse(options.vehicle).is_all:  # these are the vehicles to write to
         options = replace(options, vehicle=None)
     for text in texts:
-        check_link(link_of(text))
+        check_link(sources.link_of(text))
     found: dict[str, ParamSet] = {}
-    for text in sorted(texts, key=lambda text: (not is_file(text), not is_offline(text))):
+    for text in sorted(texts, key=lambda text: (not sources.is_file(text), not sources.is_offline(text))):
         if text not in found:
             (found[text],), _ = await sets_of(text, options, writes=writes)
             options = replace(options, extended=options.extended or found[text].is_extended)
@@ -106,20 +97,21 @@ async def sets_of(
         VehicleError: some parameters were not received; the message names them.
         ParamClientError: the cache has no such table; the vehicle did not answer; the link failed.
     """
-    choice, link = ChosenVehicle.parse(options.vehicle), link_of(text)
+    choice, link = ChosenVehicle.parse(options.vehicle), sources.link_of(text)
     check_link(link)
-    if is_offline(text):
-        read = bind(read_source, text, component=choice.component, every=choice.is_all, cache=options.place)
-        read = bind(read, extended=options.extended, incomplete=incomplete)
+    if sources.is_offline(text):
+        read = bind(sources.read_source, text, component=choice.component, every=choice.is_all)
+        read = bind(read, extended=options.extended, incomplete=incomplete, cache=options.place)
         file = await anyio.to_thread.run_sync(read)  # a log of 100 MB takes seconds
         assert file is not None, "it is no link"
-        return [*file.sets] if choice.is_all else [choose(file, choice.component, choice.system)], False
+        found = [*file.sets] if choice.is_all else [sources.choose(file, choice.component, choice.system)]
+        return found, False
 
     async def fetch(session: CommandSession) -> ParamSet:
         result, source = await session.fetch(), f"link {session.client.link.name}"
         for note in result.notes:
             report(f"{session.label} on {session.client.link.name}: {note}")
-        return fetched_set(session.component, result, source=source, partial=incomplete)
+        return sources.fetched_set(session.component, result, source=source, partial=incomplete)
 
     if link.startswith(f"{LinkKind.REPLAY}:"):  # --cache is for other sources, and for metadata
         options = replace(options, cache=None, no_cache=True)
@@ -138,7 +130,7 @@ def check_link(text: str) -> None:
             not exist.
     """
     try:
-        if not is_offline(text):
+        if not sources.is_offline(text):
             parse_link(text)
     except UsageError as error:
         if PurePath(text).suffix.lower() in _ENDINGS:
@@ -229,7 +221,7 @@ def _differing(whole: ParamSet, metadata: Metadata | None) -> ParamSet | None:
     """Return the parameters that differ from the defaults; None, and an error line, if none is known to."""
     described = defaults_in(metadata, whole)
     try:
-        differing = select_non_defaults(whole, described)
+        differing = sources.select_non_defaults(whole, described)
     except UsageError as error:
         report(f"{address(whole)}: {no_defaults() if str(error) in no_defaults() else error}")
         return None
@@ -265,12 +257,12 @@ async def diff(
             one is not, those that only the left side has.
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
     """
-    if left == right and not is_offline(left):
+    if left == right and not sources.is_offline(left):
         hint = "`paramclient diff 1 2` compares two vehicles in the cache"
         raise UsageError(f"both sides are the vehicle on {left}; {hint}")
     given = [left, right, *([] if base in (None, DEFAULTS) else [base or ""])]
     first, second, *third = await resolve_all(given, options)
-    if partial and is_file(right) and not is_file(left):
+    if partial and sources.is_file(right) and not sources.is_file(left):
         first = part_of(first, second)
     elif partial:
         second = part_of(second, first)
@@ -278,7 +270,7 @@ async def diff(
     before = third[0] if third else None
     if base == DEFAULTS:
         try:
-            before = collect_defaults([first, second], [*map(defaults_in, known, (first, second))])
+            before = sources.collect_defaults([first, second], [*map(defaults_in, known, (first, second))])
         except UsageError:
             raise UsageError(no_defaults()) from None
         known.append(known[0] or known[1])
@@ -292,7 +284,7 @@ async def diff(
             if params is not None:
                 say(f"{side}: {described(params)}")
         say(_summary(found))
-        if not (partial or outcome.is_same) and is_file(left) != is_file(right):
+        if not (partial or outcome.is_same) and sources.is_file(left) != sources.is_file(right):
             say("--partial leaves out the parameters that the file does not have")
     return ExitCode.DONE if outcome.is_same else ExitCode.DIFFERENT
 
@@ -330,10 +322,9 @@ def _summary(found: JsonObject) -> str:
     other = sum(entry["types_differ"] for entry in found["params"].values())
     words = [f"{number} {kind}" for kind, number in (counts | {"of another type": other}).items() if number]
     if sides is not None:
-        unknown = sum(counts.values()) - sum(sides.values())
+        sides |= {"not in the base": sum(counts.values()) - sum(sides.values())}
         changed = [f"{number} {side}" for side, number in sides.items() if number and side != "neither"]
         words.append(f"changed from the base: {', '.join(changed) or 'none'}")
-        words += [f"{unknown} not in the base"] if unknown else []
     return "; ".join(words)
 
 

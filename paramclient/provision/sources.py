@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
@@ -51,7 +51,6 @@ async def resolve(
     component: int | None = None,
     extended: bool = False,
     cache: ParamCache | str | bool | None = None,
-    fetch: Callable[[str], Awaitable[ParamSet]] | None = None,
 ) -> ParamSet:
     """Return the parameters that a text names.
 
@@ -67,7 +66,6 @@ async def resolve(
         system, component: select a set of a file, a table of the cache, or a vehicle of the link.
         extended: extended parameters of a vehicle; a file with them needs no mention.
         cache: as in `ParamClient`; False excludes vehicles of the cache.
-        fetch: returns the parameters of a link; by default, a new client fetches them.
 
     Raises:
         UsageError: the text names none of the three; a file cannot be read (FileError).
@@ -79,8 +77,6 @@ async def resolve(
     if (found := await anyio.to_thread.run_sync(read)) is not None:  # a log of 100 MB takes seconds
         return choose(found, component, system)
     link = link_of(text)
-    if fetch is not None:
-        return await fetch(link)
     async with ParamClient(link, cache=cache if link == text else False) as client:
         vehicle = await client.component(system, component)
         vehicle = vehicle.ext if extended else vehicle

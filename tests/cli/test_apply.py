@@ -73,8 +73,8 @@ def test_apply_sets_and_verifies_values_that_differ(command: Command, put: Put, 
     assert announced == f"writing to {RECEIVER} on udpin:0.0.0.0:14550"
     assert re.fullmatch(rf"{RECEIVER}: 2 accepted, 1 unchanged, 1 skipped in \d\.\d s", line)
     assert notes == [
-        "1/1 ardupilot: left out: 1 calibration; to write them: --include calibration",
         "1/1 ardupilot: ranges not checked: 2 of 2 have no metadata",
+        "1/1 ardupilot: left out: 1 calibration; to write them: --include calibration",
     ]
     assert vehicle.values["RTL_ALT"] == 2500
     assert vehicle.values["COMPASS_OFS_X"] == 5.0

@@ -112,7 +112,7 @@ def test_a_base_shows_the_side_that_has_changed(command: Command, cache: Path) -
         "F_CONFLICT": ["1.5", "2.5", "0.5", "different", "conflict"],
         "G_TYPE": ["1", "1.0", "same, INT32 and REAL32", "unknown"],
     }
-    assert "; changed from the base: 1 right, 1 conflict; 5 not in the base\n" in outcome.err
+    assert "; changed from the base: 1 right, 1 conflict, 5 not in the base\n" in outcome.err
 
 
 @pytest.mark.usefixtures("two")
