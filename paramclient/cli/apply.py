@@ -289,13 +289,9 @@ async def _run(
             if is_restore:
                 say(f"{session.prefix}the state: {described(state.params)}")
                 include += await restore_categories(session.component, state.params)
-            options = ApplyOptions(
-                include=include,
-                info=await known_of_session(session, metadata),
-                partial=partial,
-                reboot=flags.reboot,
-                allow_armed=flags.allow_armed,
-            )
+            info = await known_of_session(session, metadata)
+            options = ApplyOptions(include=include, info=info, partial=partial, reboot=flags.reboot)
+            options["allow_armed"] = flags.allow_armed
             if flags.backup is not None:
                 options["backup"] = path = await fill_pattern(flags.backup, session)
                 if path in backups or await anyio.Path(path).exists():

@@ -19,7 +19,7 @@ from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Coloured, Status, code_of, report, require_consent, say
 from paramclient.cli.session import CommandSession, Sessions, Shown, sessions, spelling
 from paramclient.client.component import SETTLE_MAX
-from paramclient.errors import ParamClientError, UnknownParameter, UsageError
+from paramclient.errors import UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.metadata.info import ParamInfo, number_of
 from paramclient.model.values import ParamType, Value, check_name, format_value, parse_ext_value
@@ -111,8 +111,10 @@ async def _prepare(
         ParamClientError: a type could not be read.
     """
     component, job = session.component, SetJob(session, settle, force)
-    named = [f"{name}: {text!r} is not a number" for name, text in texts.items() if not _is_number(text)]
     if not component.is_extended:
+        named = [
+            f"{name}: {text!r} is not a number" for name, text in texts.items() if number_of(text) is None
+        ]
         job.described = await known_of_session(session, choice, needed_for=named[0] if named else "")
     for given, text in texts.items():
         name = spelling(given, component)
@@ -120,10 +122,9 @@ async def _prepare(
             kind = await _type_of(session, name)
             job.writes[name] = text if kind is None else parse_ext_value(name, text, kind)
             continue
-        if (info := info_of(job.described, name)) is None and not _is_number(text):
-            raise UsageError(f"{name}: {text!r} is not a number, and no metadata describes {name}")
-        job.writes[name] = value = (info or ParamInfo(name)).parse(text)
-        if info is not None and (problem := info.problem(value)) is not None:
+        info = info_of(job.described, name) or ParamInfo(name)
+        job.writes[name] = value = info.parse(text)
+        if (problem := info.problem(value)) is not None:
             job.doubts.append(problem)
         if isinstance(value, float) and math.isfinite(value) and not value.is_integer():
             kind = await _type_of(session, name)
@@ -140,12 +141,6 @@ async def _type_of(session: CommandSession, name: str) -> ParamType | None:
         known = component.params.get(name) or await component.get(name, timeout=session.deadline.left())
         return known.type
     return None
-
-
-def _is_number(text: str) -> bool:
-    with suppress(UsageError):
-        return number_of(text) is not None
-    return True  # beyond the range of a float
 
 
 # Writes
@@ -199,10 +194,11 @@ class SetJob:
     arrived: dict[str, SetOutcome] = field(default_factory=dict)
 
     async def write(self) -> Self:
-        """Write the values; afterwards each has an outcome in any case.
+        """Write the values, and return the job, in which each has an outcome.
 
         Raises:
-            AmbiguousVehicle, NoReply, LinkError: as from `CommandSession.check_only`; nothing was written.
+            AmbiguousVehicle: as from `CommandSession.check_only`; nothing was written.
+            NoReply, LinkError: nothing was written.
         """
         session, is_announced = self.session, False
         await session.check_only()
@@ -218,15 +214,10 @@ class SetJob:
 
         label, timeout = session.label, session.deadline.left()
         with Status(f"waiting for {label} to acknowledge PARAM_SET", f"setting {label}") as status:
-            try:
-                done = await session.component.set_many(
-                    self.writes, progress=update, timeout=timeout, settle=self.settle, force=self.force
-                )
-                outcomes = done.outcomes
-            except ParamClientError as error:  # raised only if nothing was written
-                pairs = self.writes.items()
-                outcomes = tuple(SetOutcome(*pair, SetStatus.NOT_TRIED, error=error) for pair in pairs)
-        self.arrived = {each.name: each for each in outcomes}
+            done = await session.component.set_many(
+                self.writes, progress=update, timeout=timeout, settle=self.settle, force=self.force
+            )
+        self.arrived = {each.name: each for each in done.outcomes}
         return self
 
     @property
