@@ -221,13 +221,6 @@ def test_a_file_is_read_from_the_standard_input(
     assert outcome.json["right"]["source"] == "standard input"
 
 
-def test_show_prints_a_file(command: Command, write: Write) -> None:
-    path = write("both.params", "1\t1\tA\t1\t6", "1\t100\tB\t0.1\t9")
-    shown = command("show", path)
-    assert (shown.code, shown.rows[:2]) == (0, [["name", "value", "type"], ["A", "1", "INT32"]])
-    assert shown.err == "1 parameter of 1/1 from both.params\n1 parameter of 1/100 from both.params\n"
-
-
 # Links
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,22 +72,24 @@ def test_a_name_finds_one_vehicle(place: int, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("reason", "name"), [(why, each) for why, names in UNKNOWN.items() for each in names]
+    ("name", "reason", "listed"),
+    [
+        *((name, why, range(len(KEPT))) for why, names in UNKNOWN.items() for name in names),
+        *(
+            (name, f"vehicle {name} fits 2 vehicles in the cache here:", fits)
+            for name, fits in AMBIGUOUS.items()
+        ),
+    ],
 )
-def test_an_unknown_name_lists_the_vehicles(reason: str, name: str) -> None:
-    with pytest.raises(UnknownVehicle) as caught:
+def test_an_unknown_or_ambiguous_name_lists_the_vehicles(
+    name: str, reason: str, listed: Sequence[int]
+) -> None:
+    kind: type[UnknownVehicle | AmbiguousVehicle] = AmbiguousVehicle if name in AMBIGUOUS else UnknownVehicle
+    with pytest.raises(kind) as caught:
         find_vehicle(KEPT, name, place="here")
     assert reason in str(caught.value)
-    assert caught.value.vehicles == tuple(map(str, KEPT))
-    assert all(f"\n  {each}" in str(caught.value) for each in KEPT)
-
-
-@pytest.mark.parametrize(("name", "fits"), AMBIGUOUS.items())
-def test_an_ambiguous_name_lists_the_matching_vehicles(name: str, fits: list[int]) -> None:
-    with pytest.raises(AmbiguousVehicle) as caught:
-        find_vehicle(KEPT, name, place="here")
-    assert caught.value.vehicles == tuple(str(KEPT[each]) for each in fits)
-    assert f"vehicle {name} fits 2 vehicles in the cache here:\n  {KEPT[fits[0]]}" in str(caught.value)
+    assert caught.value.vehicles == tuple(str(KEPT[each]) for each in listed)
+    assert all(f"\n  {KEPT[each]}" in str(caught.value) for each in listed)
 
 
 def test_a_system_id_means_the_vehicle_with_the_autopilot_and_not_its_camera() -> None:
