@@ -13,13 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 import paramclient
-from paramclient.cache import (
-    BY_VEHICLE,
-    ParamCache,
-    StoredParam,
-    TableState,
-    TableUpdate,
-)
+from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.cache.database import APPLICATION_ID
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, ParamType, from_bits

@@ -86,17 +86,3 @@ def test_live_applies_values_in_groups_and_puts_everything_back() -> None:
     assert vehicle.values == before
     vehicle.set_param("GRIP_ENABLE", 1)
     assert vehicle.values["GRIP_LIMIT0"] == 5.0  # what is hidden too
-
-
-def test_live_keeps_the_cache_of_warm_starts_and_counts_their_bytes() -> None:
-    vehicle = ArduPilotVehicle()
-    before = vehicle.values
-    with flying(vehicle) as link:
-        rows = ["--row", "warm, unchanged", "--row", "warm, two"]
-        text = bench("live", link, "--kind", "ardupilot", "--seeds", "2", *rows)
-    found = [line.split(" | ") for line in text.splitlines() if "warm" in line]
-    assert len(found) == 6, text
-    proven = [row for row in found if "changed, 100 ms" not in row[0]]  # there a download may be quicker
-    assert all(50 < int(row[3].replace(",", "")) < 15_000 for row in proven), text
-    assert "from" not in text, text
-    assert {name for name in before if vehicle.values[name] != before[name]} <= {"STAT_RUNTIME"}

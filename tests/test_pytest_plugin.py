@@ -80,17 +80,6 @@ def test_with_neither(px4, param_client, param_cache):
     asyncio.run(session(px4, param_client, param_cache))
 
 
-def test_of_ardupilot(sim_ardupilot):
-    copter = sim_ardupilot(table={"RTL_ALT": 1500})
-
-    async def session():
-        async with ParamClient(copter) as client:
-            vehicle = await client.component()
-            assert (await vehicle.get("RTL_ALT")).value == 1500
-
-    asyncio.run(session())
-
-
 def test_the_users_cache_is_the_users_again():
     assert ParamCache().path == BEFORE
     assert not BEFORE.exists()

@@ -50,8 +50,7 @@ _include: Final = re.compile(r"@include[ \t]+(.*\S)").fullmatch
 _blanks: Final = re.compile(r"[ \t]+")
 _between: Final = re.compile(r"[ \t]*[,=][ \t]*|[ \t]+")
 _decimal_comma: Final = re.compile(r"(?:^|[ \t,=])[+-]?[0-9]+,[0-9]+$").search
-is_qgc_row: Final = re.compile(r"[0-9]+[ \t]+[0-9]+[ \t]+[^ \t]+[ \t]+[^ \t]+[ \t]+[0-9]+").fullmatch
-"""Whether a line could be one of QGroundControl's."""
+_qgc_row: Final = re.compile(r"[0-9]+[ \t]+[0-9]+[ \t]+[^ \t]+[ \t]+[^ \t]+[ \t]+[0-9]+").fullmatch
 
 Comments: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
 """The header and the footer of a file."""
@@ -185,6 +184,11 @@ class _Pairs:
 
 
 # QGroundControl's
+
+
+def is_qgc_row(text: str) -> bool:
+    """Return whether a line could be one of QGroundControl's."""
+    return _qgc_row(text) is not None
 
 
 def read_qgc(reading: Reading, file_format: FileFormat) -> ParamFile:

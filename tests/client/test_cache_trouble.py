@@ -16,7 +16,7 @@ from unittest import mock
 import anyio
 import pytest
 
-from paramclient import CacheError, NotDurable, ParamCache, ParamClient, Trust, UsageError
+from paramclient import CacheError, NotDurable, ParamCache, ParamClient, Trust, UnknownParameter, UsageError
 from paramclient.cache import TableUpdate, database
 from paramclient.client import cache_writer
 from paramclient.provision import apply
@@ -202,15 +202,24 @@ async def test_a_durable_set_is_on_the_disk_with_its_line_when_it_returns(tmp_pa
 async def test_without_a_disk_nothing_is_sent_or_it_is_said_what_the_vehicle_has(tmp_path: Path) -> None:
     vehicle = small_px4()
     async with connected(vehicle, cache=False) as (_, component):
+        values = {NAME: 5.0}
+        for call in (component.set_many(values, durable=True), apply(component, values, durable=True)):
+            with pytest.raises(UsageError, match="durable needs a cache"):
+                await call
         with pytest.raises(UsageError, match="durable needs a cache"):
             await component.set(NAME, 5.0, durable=True)
-        with pytest.raises(UsageError, match="durable needs a cache"):
-            await apply(component, {NAME: 5.0}, durable=True)
     assert vehicle.values[NAME] != 5.0
     async with fetched(vehicle, cache=tmp_path / "cache") as (client, component):
         with no_disk(), pytest.raises(NotDurable, match=f"1/1 has accepted {NAME}, but .*: no room"):
             await component.set(NAME, 10.0, durable=True)
         assert vehicle.values[NAME] == component.params[NAME].value == 10.0
+        with no_disk():
+            result = await component.set_many({NAME: 3, "NO_SUCH": 1, "PARAM_02": 4}, durable=True)
+        assert isinstance(result.error, NotDurable)
+        assert isinstance(result["PARAM_02"].error, NotDurable)
+        assert (result["PARAM_02"].status, result["PARAM_02"].is_set) == ("accepted", True)
+        assert isinstance(result["NO_SUCH"].error, UnknownParameter)
+        assert not result.is_complete
         await component.set(NAME, 11.0, durable=True)
         assert client.cache is not None
         assert client.cache.component().params[NAME].value == 11.0

@@ -164,22 +164,6 @@ class Reticent(PX4Vehicle):
             super().respond(message, sender)
 
 
-PARAMETER_REQUESTS = (messages.ParamRequestRead, messages.ParamRequestList)
-
-
-@pytest.mark.parametrize("unanswered", [PARAMETER_REQUESTS, (*PARAMETER_REQUESTS, messages.CommandLong)])
-async def test_a_silent_component_with_a_cached_table_delays_no_other(path: Path, unanswered: Any) -> None:
-    vehicle, silent = small_px4(), Reticent(system=2, table=VALUES)
-    async with a_client(Air([vehicle, silent]), cache=path) as client:
-        assert not (await client.fetch_all()).silent
-    silent.unanswered = unanswered
-    async with a_client(Air([vehicle, silent]), cache=path) as client:
-        everything = await client.fetch_all()
-        assert everything.results[1, 1].elapsed < 0.5
-        assert everything.results.keys() == {(1, 1)}
-        assert everything.silent.keys() == {(2, 1)}
-
-
 # Who it is
 
 

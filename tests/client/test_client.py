@@ -11,7 +11,6 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import anyio
 import anyio.abc
@@ -30,7 +29,6 @@ from paramclient import (
     errors,
 )
 from paramclient.client import link_task
-from paramclient.client.cache_writer import CacheWriter
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire import messages
@@ -409,24 +407,6 @@ async def test_a_link_that_stays_disconnected_fails_only_calls(caplog: pytest.Lo
     assert "reconnecting" in reported[0].getMessage()
 
 
-async def test_a_link_that_cannot_reconnect_ends_every_call() -> None:
-    tap = Tap(generic())
-    link = FlakyLink(tap)
-    link.reconnects = False
-    async with connected(link) as (client, component):
-        tap.is_mute = True
-        waiting = under_way(client, component)
-        await settled()
-        await link.drop()
-        for name, task in waiting.items():
-            assert type(await task) is errors.LinkError, name
-        for name, call in CALLS.items():
-            assert type(await outcome(call(client, component))) is errors.LinkError, name
-        assert "closed" in repr(client)
-        assert not residue(component)
-    assert isinstance(await outcome(component.get("PARAM_01")), errors.ClientClosed)
-
-
 # many writes in one call
 
 MANY: dict[str, int | float] = {f"MANY_{number:03}": float(number) for number in range(200)}
@@ -499,23 +479,6 @@ async def test_nothing_is_sent_if_an_argument_is_wrong(values: dict[str, int], m
         assert (await component.set_many({})).is_complete
         await asyncio.sleep(1.0)
         assert not tap.messages(messages.ParamSet)
-
-
-async def test_values_that_are_not_on_the_disk_are_reported_as_such(tmp_path: Path) -> None:
-    async with fetched(small_px4(), cache=tmp_path / "cache") as (_, component):
-        assert (await component.set_many({"PARAM_01": 2}, durable=True)).is_complete
-        failing = mock.AsyncMock(side_effect=errors.CacheError("disk I/O error"))
-        with mock.patch.object(CacheWriter, "write_durably", failing):
-            result = await component.set_many({"PARAM_01": 3, "NO_SUCH": 1, "PARAM_02": 4}, durable=True)
-        assert isinstance(result.error, errors.NotDurable)
-        assert isinstance(result["PARAM_02"].error, errors.NotDurable)
-        assert result["PARAM_02"].status is SetStatus.ACCEPTED
-        assert result["PARAM_02"].is_set
-        assert isinstance(result["NO_SUCH"].error, errors.UnknownParameter)
-        assert not result.is_complete
-    with pytest.raises(errors.UsageError, match="durable"):
-        async with a_client(small_px4()) as client:
-            await (await client.component()).set_many({"PARAM_01": 2}, durable=True)
 
 
 # files

@@ -9,14 +9,13 @@ from pathlib import Path
 import anyio
 import pytest
 
-from paramclient import NoReply, ParamClient, ParamType, Policy, SyncState, Trust, UsageError
+from paramclient import NoReply, ParamType, Policy, SyncState, Trust, UsageError
 from paramclient.cli import run
 from paramclient.client.component import PASSIVE_TIMEOUT
 from paramclient.model.values import Encoding, encode_value
-from paramclient.sim import Endpoint
 from paramclient.wire import messages
-from tests.client.conftest import table_in
-from tests.shell import Radio, bits, generic, residue, small_px4
+from tests.client.conftest import connected, table_in
+from tests.shell import Radio, a_client, bits, generic, residue, small_px4
 
 LIST = messages.ParamRequestList(1, 1)
 HASH = messages.ParamRequestRead(1, 1, messages.HASH_CHECK, -1)
@@ -30,14 +29,9 @@ class Channel(Radio):
             self.other.append(messages.encode(message, system=system, component=190, sequence=0))
 
 
-def listener(link: Endpoint, **options: object) -> ParamClient:
-    return ParamClient(link, **{"cache": False, "listen_only": True} | options)  # type: ignore[arg-type]  # any
-
-
 async def test_not_a_byte_is_sent() -> None:
     channel = Channel(small_px4())
-    async with listener(channel) as client:
-        component = await client.component()
+    async with connected(channel, listen_only=True) as (client, component):
         assert (component.autopilot, component.state) == ("px4", "new")
         assert component.identity.uid is None
         with pytest.raises(NoReply):
@@ -57,8 +51,7 @@ async def test_not_a_byte_is_sent() -> None:
 async def test_the_list_that_another_station_requests_fills_the_table() -> None:
     vehicle = small_px4()
     channel = Channel(vehicle)
-    async with listener(channel) as client:
-        component = await client.component()
+    async with connected(channel, listen_only=True) as (client, component):
         channel.ask(LIST)
         result = await component.fetch_all()
         assert bits(result.params) == bits(vehicle.params)
@@ -77,8 +70,7 @@ async def test_the_list_that_another_station_requests_fills_the_table() -> None:
 
 async def test_a_write_of_another_station_is_a_change_with_its_author() -> None:
     channel = Channel(generic())
-    async with listener(channel) as client:
-        component = await client.component()
+    async with connected(channel, listen_only=True) as (_, component):
         channel.ask(LIST)
         await component.fetch_all()
         changes = component.changes()
@@ -93,8 +85,7 @@ async def test_a_write_of_another_station_is_a_change_with_its_author() -> None:
 
 async def test_calls_that_send_are_refused_at_once() -> None:
     channel = Channel(small_px4())
-    async with listener(channel) as client:
-        component = await client.component()
+    async with connected(channel, listen_only=True) as (client, component):
         calls: list[Callable[[], Awaitable[object]]] = [
             lambda: component.get("PARAM_01"),
             lambda: component.get(0),
@@ -114,14 +105,13 @@ async def test_calls_that_send_are_refused_at_once() -> None:
 def test_policy_and_watch_interval_are_refused_with_listen_only() -> None:
     for options in ({"policy": Policy.HASH_ONLY}, {"watch_interval": 5.0}):
         with pytest.raises(UsageError, match="the client only listens"):
-            listener(small_px4(), **options)
-    listener(small_px4(), watch_interval=0, policy="auto")
+            a_client(small_px4(), listen_only=True, **options)
+    a_client(small_px4(), listen_only=True, watch_interval=0, policy="auto")
 
 
 @pytest.mark.parametrize("timeout", [None, 3.0])
 async def test_fetch_all_without_any_request_of_others_ends_with_no_reply(timeout: float | None) -> None:
-    async with listener(Channel(generic())) as client:
-        component = await client.component()
+    async with connected(Channel(generic()), listen_only=True) as (client, component):
         for fetch_all in (component.fetch_all, client.fetch_all):
             began = anyio.current_time()
             with pytest.raises(NoReply) as error:
@@ -137,14 +127,12 @@ async def test_a_cached_table_is_confirmed_by_a_hash_that_others_ask_for(tmp_pat
     path = tmp_path / "cache"
     channel = Channel(vehicle)
     version = messages.CommandLong(1, 1, messages.MAV_CMD_REQUEST_MESSAGE, 148.0)
-    async with listener(channel, cache=path) as client:
-        component = await client.component()
+    async with connected(channel, cache=path, listen_only=True) as (_, component):
         channel.ask(version, LIST)
         assert (await component.fetch_all()).source == "stream"
     kept = table_in(path, system=1)
     assert (kept.hash, kept.complete, kept.volatile_known) == (vehicle.announced_hash(), True, True)
-    async with listener(channel, cache=path) as client:
-        component = await client.component()
+    async with connected(channel, cache=path, listen_only=True) as (_, component):
         channel.ask(version)
         await anyio.sleep(2.0)
         assert (component.state, len(component.params)) == ("cached", 25)

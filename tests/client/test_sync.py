@@ -24,7 +24,7 @@ from paramclient import (
     Trust,
     errors,
 )
-from paramclient.model.values import ParamType, Value
+from paramclient.model.values import Value
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import frames
 from paramclient.wire.messages import (
@@ -37,6 +37,7 @@ from paramclient.wire.messages import (
 )
 from tests.client.conftest import connected, fetched, table_in
 from tests.conversations.test_fetch import new_vehicle
+from tests.conversations.test_writes import free_names
 from tests.conversations.virtual import Silence
 from tests.shell import (
     VALUES,
@@ -90,8 +91,7 @@ async def away(tap: Tap, seconds: float) -> None:
 
 
 async def test_an_update_that_was_lost_is_reported_within_one_interval() -> None:
-    vehicle = small_px4()
-    tap = Tap(vehicle)
+    tap = Tap(vehicle := small_px4())
     async with fetched(tap, watch_interval=10.0) as (client, component):
         await asyncio.sleep(1.0)
         events, changes = client.events(), component.changes()
@@ -222,8 +222,7 @@ def test_intervals_and_policies_that_cannot_be() -> None:
 
 
 async def test_lost_and_found() -> None:
-    vehicle = small_px4()
-    tap = Tap(vehicle)
+    tap = Tap(vehicle := small_px4())
     async with fetched(tap, watch_interval=5.0) as (client, component):
         events = client.events()
         tap.is_mute = tap.is_deaf = True
@@ -273,8 +272,7 @@ async def test_a_link_that_was_disconnected_is_checked_like_a_loss(seconds: floa
 
 
 async def test_a_watch_survives_a_link_that_drops_during_a_check() -> None:
-    vehicle = small_px4()
-    tap = Tap(vehicle)
+    tap = Tap(vehicle := small_px4())
     link = FlakyLink(tap)
     async with fetched(link, watch_interval=5.0) as (_, component):
         tap.received.clear()
@@ -445,11 +443,8 @@ async def test_several_listeners_hear_the_same() -> None:
 def silent_on(kind: str, delay: float = 0.05) -> tuple[Vehicle, Silence, dict[str, Value]]:
     """A vehicle, its link, on which it can go silent, and new values that no firmware limits."""
     vehicle = new_vehicle(kind)
-    names = [each.name for each in vehicle.listed if each.type is ParamType.REAL32]
-    ruled = ("MPC", "LNDMC", "BARO", "STAT", "MIS_", "INS")
-    free = [name for name in names if not name.startswith(ruled)][:150]
     endpoint = Silence(Air.symmetric([vehicle], delay=delay), at=1e9)
-    return vehicle, endpoint, {name: 0.25 + number for number, name in enumerate(free)}
+    return vehicle, endpoint, {name: 0.25 + number for number, name in enumerate(free_names(vehicle))}
 
 
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])

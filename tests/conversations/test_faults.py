@@ -17,23 +17,7 @@ from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
-from paramclient.wire.messages import (
-    NO_INDEX,
-    AutopilotVersion,
-    CommandAck,
-    FileTransfer,
-    Heartbeat,
-    Message,
-    ParamError,
-    ParamExtAck,
-    ParamExtValue,
-    ParamRequestList,
-    ParamSet,
-    ParamValue,
-    StatusText,
-    SystemTime,
-    encode,
-)
+from paramclient.wire import messages
 from tests.conversations.partial import Partial
 from tests.conversations.virtual import converse, jump, meanwhile, talking, virtual, virtual_on_both
 
@@ -109,17 +93,17 @@ number, short, word = st.integers(0, 255), st.integers(0, 65535), st.integers(0,
 index = st.integers(-32768, 32767)
 raw = st.binary(min_size=4, max_size=4)
 any_message = st.one_of(
-    st.builds(ParamValue, names, raw, number, st.integers(0, 40), short),
-    st.builds(ParamError, number, number, names, index, number),
-    st.builds(ParamExtValue, names, st.binary(max_size=128), number, st.integers(0, 40), short),
-    st.builds(ParamExtAck, names, st.binary(max_size=128), number, number),
-    st.builds(ParamSet, number, number, names, raw, number),
-    st.builds(Heartbeat, number, number, number, word, number, number),
-    st.builds(SystemTime, st.integers(0, 2**64 - 1), word),
-    st.builds(CommandAck, short, number, number, number),
-    st.builds(FileTransfer, number, number, number, st.binary(max_size=251)),
-    st.builds(AutopilotVersion, st.integers(0, 2**64 - 1), word, uid=word),
-    st.builds(StatusText, number, st.text(st.characters(max_codepoint=255), max_size=50)),
+    st.builds(messages.ParamValue, names, raw, number, st.integers(0, 40), short),
+    st.builds(messages.ParamError, number, number, names, index, number),
+    st.builds(messages.ParamExtValue, names, st.binary(max_size=128), number, st.integers(0, 40), short),
+    st.builds(messages.ParamExtAck, names, st.binary(max_size=128), number, number),
+    st.builds(messages.ParamSet, number, number, names, raw, number),
+    st.builds(messages.Heartbeat, number, number, number, word, number, number),
+    st.builds(messages.SystemTime, st.integers(0, 2**64 - 1), word),
+    st.builds(messages.CommandAck, short, number, number, number),
+    st.builds(messages.FileTransfer, number, number, number, st.binary(max_size=251)),
+    st.builds(messages.AutopilotVersion, st.integers(0, 2**64 - 1), word, uid=word),
+    st.builds(messages.StatusText, number, st.text(st.characters(max_codepoint=255), max_size=50)),
 )
 
 
@@ -127,14 +111,14 @@ any_message = st.one_of(
 @given(st.lists(any_message, max_size=60), st.lists(st.binary(max_size=60), max_size=5))
 @virtual
 async def test_no_messages_and_no_bytes_raise_in_any_call(
-    messages: list[Message], noise: list[bytes]
+    heard: list[messages.Message], noise: list[bytes]
 ) -> None:
     async with converse(PX4Vehicle(table={"A": 1, "B": 2.5})) as conversation:
         node = await conversation.node()
         calls: list[Awaitable[object]] = [fetch_all(node.plain), fetch_all(node.extended)]
         calls += [write(node.plain, "A", 5), read(node.plain, "B")]
         async with meanwhile(*calls) as ends:
-            for message in messages:
+            for message in heard:
                 conversation.hear(message)
                 await anyio.sleep(0.003)
             for data in noise:
@@ -150,11 +134,11 @@ async def test_hostile_values_change_no_table() -> None:
         before = dict(session.table.params)
         raw = struct.pack("<i", 66)
         for name in ("A\nB", "A B", "\x1b[2J", "A,B", "\xb5", "\x7f", ""):
-            for index in (0, 1, NO_INDEX):
-                conversation.hear(ParamValue(name, raw, 6, 2, index))
+            for index in (0, 1, messages.NO_INDEX):
+                conversation.hear(messages.ParamValue(name, raw, 6, 2, index))
         for system, number in ((1, 2), (2, 1), (255, 190)):
-            conversation.hear(ParamValue("A", raw, 6, 2, 0), system=system, component=number)
-        frame = encode(ParamValue("A", raw, 6, 2, 0), system=1, component=1, sequence=0)
+            conversation.hear(messages.ParamValue("A", raw, 6, 2, 0), system=system, component=number)
+        frame = messages.encode(messages.ParamValue("A", raw, 6, 2, 0), system=1, component=1, sequence=0)
         for place in range(len(frame)):
             now = anyio.current_time()
             conversation.station.receive(frame[:place], "sim", now)
@@ -162,8 +146,8 @@ async def test_hostile_values_change_no_table() -> None:
                 frame[:place] + bytes((frame[place] ^ 1,)) + frame[place + 1 :], "sim", now
             )
         assert (dict(session.table.params), session.table.count) == (before, 2)
-        for count, index in ((0xFFFF, 5), (0xFFFF, NO_INDEX), (2, 40), (0, 0)):
-            conversation.hear(ParamValue("A", struct.pack("<i", 1), 6, count, index))
+        for count, index in ((0xFFFF, 5), (0xFFFF, messages.NO_INDEX), (2, 40), (0, 0)):
+            conversation.hear(messages.ParamValue("A", struct.pack("<i", 1), 6, count, index))
         result = await fetch_all(session, refresh=True)
         assert (result.complete, result.elapsed < 3.0) == (True, True)
         check_right(vehicle, dict(result.params))
@@ -211,7 +195,7 @@ async def test_a_slow_vehicle_is_waited_for() -> None:
     async with converse(Air.symmetric([vehicle], delay=0.5)) as conversation:
         result = await fetch_all((await conversation.node()).plain)
         assert (len(result.params), result.missing) == (40, ())
-        assert len(conversation.sent_of(ParamRequestList)) <= 3
+        assert len(conversation.sent_of(messages.ParamRequestList)) <= 3
 
 
 async def test_a_vehicle_that_restarts_in_the_middle_of_its_list_is_fetched_whole() -> None:

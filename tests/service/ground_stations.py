@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar
 
@@ -12,7 +11,6 @@ import anyio
 
 from paramclient import ParamClient
 from paramclient.client.signing import timestamp_now
-from paramclient.errors import LinkError
 from paramclient.links import Peer
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.service.gateway import Gateway
@@ -21,7 +19,7 @@ from paramclient.sim import Endpoint
 from paramclient.wire.frames import Frame, Framer, sign_frame
 from paramclient.wire.messages import DECODED_IDS, FileTransfer, Message, decode, encode
 from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
-from tests.shell import a_client
+from tests.shell import PeersLink, a_client
 
 T = TypeVar("T")
 
@@ -34,49 +32,26 @@ def free_port() -> int:
     return port
 
 
-class StationsLink:
+class StationsLink(PeersLink):
     """A link on which ground stations of the test speak to the gateway.
 
     Attributes:
-        stations: by their peer.
         is_stuck: nothing is taken, and a sender waits.
     """
 
-    is_stream = False
-    reconnects = True
-
     def __init__(self, name: str = "udpin:stations:14551") -> None:
-        self.name = name
-        self.stations: dict[Peer, Partner] = {}
-        self.said: deque[tuple[Peer, bytes]] = deque()
-        self.activity = anyio.Event()
+        super().__init__({}, name)
         self.is_stuck = False
-        self._is_open = False
 
-    async def open(self) -> None:
-        self._is_open = True
-
-    async def receive(self) -> list[tuple[Peer, bytes]]:
-        while not self.said:
-            if not self._is_open:
-                raise LinkError(f"{self.name}: closed", link=self.name)
-            self.activity = anyio.Event()
-            await self.activity.wait()
-        found = list(self.said)
-        self.said.clear()
-        return found
+    def add(self, station: Partner) -> Callable[[], None]:
+        """Add a station; return what it calls when it has something to send."""
+        self.endpoints["station", len(self.endpoints)] = station
+        return self._wake
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
-        await anyio.lowlevel.checkpoint()
         while self.is_stuck:  # noqa: ASYNC110 - set by the test
             await anyio.sleep(0.1)
-        for each, station in self.stations.items():
-            if peer in (None, each):
-                station.take(data)
-
-    async def close(self) -> None:
-        self._is_open = False
-        self.activity.set()
+        await super().send(data, peer)
 
 
 class Partner:
@@ -104,8 +79,8 @@ class Partner:
         self.lost: dict[tuple[int, int], int] = {}
         self.address = (system, component)
         self._version = version
-        self._link = link
-        self._peer = ("station", len(link.stations))
+        self._out: list[bytes] = []
+        self._wake = link.add(self)
         self._framer = Framer(stream=False)
         self.signer = None if key is None else Signer(key, link_id=100, timestamp=timestamp_now())
         self.verifier = None if self.signer is None else Verifier(self.signer, SigningPolicy.SIGNED_ONLY)
@@ -113,7 +88,6 @@ class Partner:
             self._framer.guard = self.verifier.accepts
         self._last: dict[tuple[int, int], int] = {}
         self._sequence = 0
-        link.stations[self._peer] = self
 
     def send(self, *messages: Message) -> None:
         for message in messages:
@@ -124,10 +98,20 @@ class Partner:
             self._sequence = (self._sequence + 1) & 0xFF
 
     def send_bytes(self, data: bytes) -> None:
-        self._link.said.append((self._peer, data))
-        self._link.activity.set()
+        self._out.append(data)
+        self._wake()
 
-    def take(self, data: bytes) -> None:
+    def data_to_send(self) -> list[bytes]:
+        out, self._out = self._out, []
+        return out
+
+    def tick(self, now: float) -> None:
+        """Nothing is due."""
+
+    def next_deadline(self) -> None:
+        return None
+
+    def receive(self, data: bytes, now: float) -> None:
         self.datagrams.append(data)
         for frame in self._framer.receive(data):
             source = (frame.system, frame.component)
@@ -136,7 +120,7 @@ class Partner:
                 self.lost[source] = self.lost.get(source, 0) + gap
             self._last[source] = frame.sequence
             self.frames.append(frame)
-            self.times.append(anyio.current_time())
+            self.times.append(now)
 
     def of(self, kind: type[T], *, system: int | None = None) -> list[T]:
         """The received messages of a kind."""

@@ -572,7 +572,7 @@ async def test_rule_4_different_sets_queue() -> None:
     air = Air.symmetric([small_px4()], loss=0.3, delay=0.05, seed=4)
     async with in_sync(air) as (served, _, first):
         second = served.partner(system=9)
-        second.send(set_to("PARAM_01", 9))
+        await second.ask(set_to("PARAM_01", 9), seconds=0.01)
         await first.ask(set_to("PARAM_01", 33), seconds=5.0)
         component = await served.clients[0].component()
         await component.get("PARAM_01")
@@ -832,8 +832,7 @@ async def test_rule_11_a_gateway_behind_a_gateway() -> None:
 
 async def test_rule_11_an_ardupilot_behind_two_gateways(tmp_path: Path) -> None:
     """The outer gateway downloads the file from the inner one, and proves its cached table by checksums."""
-    model = ArduPilotVehicle()
-    vehicle = Tap(model)
+    vehicle = Tap(model := ArduPilotVehicle())
     async with gateway_over(vehicle) as inner:
         await inner.synced()
         vehicle.received.clear()

@@ -115,6 +115,12 @@ def visit(browser: Browser) -> Iterator[Callable[..., Sight]]:
     assert hosts - {""} <= urls
 
 
+@pytest.fixture
+def sight(bench: Bench, visit: Callable[..., Sight]) -> Sight:
+    """The page, as it is opened."""
+    return visit(bench.url)
+
+
 def until(is_so: Callable[[], bool]) -> None:
     deadline = time.monotonic() + TIMEOUT / 1000
     while not is_so():
@@ -126,8 +132,7 @@ def value_of(bench: Bench, name: str, vehicle: str = "px4") -> Any:
     return bench.do(lambda: bench.vehicles[vehicle].param(name).value)
 
 
-def test_search_groups_and_defaults(bench: Bench, visit: Callable[..., Sight]) -> None:
-    sight = visit(bench.url)
+def test_search_groups_and_defaults(bench: Bench, sight: Sight) -> None:
     expect(sight.page.get_by_role("heading", level=1)).to_have_text("PX4 1/1")  # the lowest
     sight.search.fill("mc_roll_p")
     expect(sight.row("MC_ROLL_P")).to_be_visible()
@@ -167,9 +172,8 @@ def test_values_are_staged_reviewed_sent_and_undone(bench: Bench, visit: Callabl
     assert value_of(bench, "RTL_ALT", "ardupilot") == before
 
 
-def test_a_press_before_the_rows_are_sorted_is_a_click(bench: Bench, visit: Callable[..., Sight]) -> None:
+def test_a_press_before_the_rows_are_sorted_is_a_click(bench: Bench, sight: Sight) -> None:
     """They are sorted for screen readers after a scroll; the browser clicks no element that has moved."""
-    sight = visit(bench.url)
     cell = sight.page.locator("#rows .row .value").nth(5).bounding_box()
     assert cell is not None
     sight.page.mouse.move(cell["x"] + 5, cell["y"] + 5)
@@ -180,8 +184,7 @@ def test_a_press_before_the_rows_are_sorted_is_a_click(bench: Bench, visit: Call
     expect(sight.editor).to_be_visible()
 
 
-def test_a_value_out_of_range_needs_a_confirmation(bench: Bench, visit: Callable[..., Sight]) -> None:
-    sight = visit(bench.url)
+def test_a_value_out_of_range_needs_a_confirmation(bench: Bench, sight: Sight) -> None:
     high = bench.ask("GET", "/vehicles/1/1/params/MC_ROLL_P")["metadata"]["maximum"] + 1
     sight.stage("MC_ROLL_P", str(high))
     sight.bar.get_by_role("button", name="Review").click()
@@ -196,8 +199,7 @@ def test_a_value_out_of_range_needs_a_confirmation(bench: Bench, visit: Callable
     assert value_of(bench, "MC_ROLL_P") == high
 
 
-def test_changes_by_others_appear_with_their_history(bench: Bench, visit: Callable[..., Sight]) -> None:
-    sight = visit(bench.url)
+def test_changes_by_others_appear_with_their_history(bench: Bench, sight: Sight) -> None:
     bench.set("MC_YAW_P", 3.5)
     sight.search.fill("MC_YAW_P")
     expect(sight.value("MC_YAW_P")).to_contain_text("3.5")
@@ -241,15 +243,13 @@ def test_a_snapshot_is_stored_compared_and_taken_over(bench: Bench, visit: Calla
     assert value_of(bench, "MC_ROLLRATE_D") == pytest.approx(before)
 
 
-def test_another_vehicle_is_compared(bench: Bench, visit: Callable[..., Sight]) -> None:
-    sight = visit(bench.url)
+def test_another_vehicle_is_compared(bench: Bench, sight: Sight) -> None:
     sight.act("Compare")
     sight.dialog.get_by_role("button", name="ArduPilot 2/1").click()
     expect(sight.page.get_by_role("region", name="Comparison")).to_contain_text("only here")
 
 
-def test_a_table_is_fetched_and_saved(bench: Bench, visit: Callable[..., Sight], tmp_path: Path) -> None:
-    sight = visit(bench.url)
+def test_a_table_is_fetched_and_saved(bench: Bench, sight: Sight, tmp_path: Path) -> None:
     sight.act("Fetch")
     sight.act("Save")
     with sight.page.expect_download() as download:
@@ -273,8 +273,7 @@ def test_ground_stations_are_shown_with_what_cache_saved(bench: Bench, visit: Ca
     station.close()
 
 
-def test_extended_parameters_are_staged_and_undone(bench: Bench, visit: Callable[..., Sight]) -> None:
-    sight = visit(bench.url)
+def test_extended_parameters_are_staged_and_undone(bench: Bench, sight: Sight) -> None:
     camera = "Camera 4/100, extended"
     sight.page.get_by_role("navigation").get_by_role("button", name=camera).click()
     expect(sight.page.locator("#empty")).to_contain_text("Fetch requests them")
@@ -293,8 +292,7 @@ def test_extended_parameters_are_staged_and_undone(bench: Bench, visit: Callable
     assert bench.ask("GET", f"/vehicles/4/100/params/{name}?ext=true&live=true")["value"] == before
 
 
-def test_names_with_markup_are_shown_as_text(bench: Bench, visit: Callable[..., Sight]) -> None:
-    sight = visit(bench.url)
+def test_names_with_markup_are_shown_as_text(bench: Bench, sight: Sight) -> None:
     sight.choose("PX4 3/1")
     for name in HOSTILE:
         expect(sight.row(name)).to_be_visible()
