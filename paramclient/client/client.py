@@ -25,6 +25,7 @@ from paramclient.model.names import counted
 from paramclient.model.values import Encoding
 from paramclient.protocol import selection
 from paramclient.protocol.addresses import Address
+from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult, Policy
 from paramclient.protocol.identity import HEARTBEAT_WAIT
 from paramclient.protocol.node import Node
@@ -579,7 +580,6 @@ async def _fetch_components(
     """
     results: dict[Address, FetchResult] = {}
     silent: dict[Address, NoReply | CacheError] = {}
-    failures: list[ParamClientError] = []
     scopes: dict[Address, anyio.CancelScope] = {}
 
     async def fetch(address: Address, component: Component) -> None:
@@ -588,9 +588,6 @@ async def _fetch_components(
                 results[address] = await component.fetch_all(refresh=refresh, timeout=timeout)
         except (NoReply, CacheError) as error:
             silent[address] = error
-        except ParamClientError as error:
-            failures.append(error)
-            fetches.cancel_scope.cancel()
 
     async def give_up_silent() -> None:
         await anyio.sleep_until(began + SILENT_TIME)
@@ -600,14 +597,12 @@ async def _fetch_components(
                 if not has_answered[address] and each.count is None:
                     scopes[address].cancel()
 
-    async with anyio.create_task_group() as tasks:
+    async with task_group() as tasks:
         tasks.start_soon(give_up_silent)
-        async with anyio.create_task_group() as fetches:
+        async with task_group() as fetches:
             for address, component in components.items():
                 fetches.start_soon(fetch, address, component)
         tasks.cancel_scope.cancel()
-    if failures:
-        raise failures[0]
     if silent and not results:
         raise next(iter(silent.values()))
     return FetchedAll(results, silent)

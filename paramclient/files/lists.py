@@ -144,8 +144,7 @@ class _Pairs:
     def _include(self, line: TextLine, path: str, source: str, chain: tuple[Path, ...]) -> None:
         before = self._reading.fault_count
         try:
-            name, text, chain = self._included(path, source, chain)
-            self.read(text, name, chain)
+            self._read_included(path, source, chain)
         except UsageError as error:
             what = f"@include with a file that can be read ({error})"
             self._reading.bad_line(line, what, source)
@@ -153,8 +152,8 @@ class _Pairs:
         if self._reading.fault_count > before:
             self._reading.fault(line.number, "includes that file", source=source)
 
-    def _included(self, path: str, source: str, chain: tuple[Path, ...]) -> tuple[str, str, tuple[Path, ...]]:
-        """Return the name and the text of an included file, and the chain for the files that it includes.
+    def _read_included(self, path: str, source: str, chain: tuple[Path, ...]) -> None:
+        """Add the parameters of an included file.
 
         A path is relative to the folder of the file with the line. The file must be in the folder of the
         first file, beside that folder, or below either, also after symbolic links are resolved.
@@ -180,7 +179,7 @@ class _Pairs:
         self._sizes.append(len(data))
         if sum(self._sizes) > LARGEST_FILE:
             raise UsageError("the included files are too large together")
-        return name, decode_text(data, name), chain
+        self.read(decode_text(data, name), name, chain)
 
 
 # QGroundControl's

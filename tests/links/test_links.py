@@ -254,6 +254,8 @@ def test_any_text_is_a_link_or_a_usage_error(text: str) -> None:
     [
         ("px4?loss=1.1", "loss must be 0 to 1, not 1.1"),
         ("px4?delay=-1", "delay must be 0 or more"),
+        ("px4?loss_burst=0.5", "loss_burst must be 1 or more"),
+        ("px4?rate=100&queue=-1", "queue must be 0 or more"),
         ("px4?rate=0", "rate must be a number of bytes per second above 0"),
         ("px4?queue=100", "queue needs a rate"),
         ("px4?system=0", "system must be 1 to 255"),

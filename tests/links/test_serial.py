@@ -25,7 +25,7 @@ from paramclient.links import Link, Peer, create_link, link, serial
 from paramclient.links.serial import open_asyncio
 from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
-from tests.shell import a_client, bits, generic, small_px4, until
+from tests.shell import a_client, bits, generic, until
 
 HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
 RATE = 40_000.0
@@ -67,24 +67,6 @@ async def refusal(link: Link) -> LinkError:
 
 
 # Complete sessions
-
-
-@pytest.mark.asyncio
-async def test_a_whole_session(cable: Cable, port: str) -> None:
-    vehicle = small_px4(stream=True)
-    async with (
-        asyncio.timeout(TIMEOUT),
-        a_client(cable.link) as client,
-        anyio.create_task_group() as tasks,
-    ):
-        tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
-        component = await client.component()
-        result = await component.fetch_all()
-        assert result.complete
-        assert bits(result.params) == bits(vehicle.params)
-        assert (await component.set("PARAM_01", 77)).status == "accepted"
-        assert (await component.get("PARAM_01")).value == 77
-        tasks.cancel_scope.cancel()
 
 
 @pytest.mark.asyncio

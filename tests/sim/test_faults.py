@@ -19,12 +19,6 @@ TEN = {f"P{number}": number for number in range(10)}
 CLOCK_REQUEST = messages.CommandLong(
     1, 1, messages.MAV_CMD_REQUEST_MESSAGE, float(messages.message_id(messages.SystemTime))
 )
-EVERY_KIND = pytest.mark.parametrize("kind", [GenericVehicle, PX4Vehicle, ArduPilotVehicle])
-
-
-def listed(station: Station, seconds: float = 0.5) -> list[int]:
-    """Return the indices that a list sends."""
-    return [index for index in indices(station.ask(LIST, seconds=seconds)) if index != NO_INDEX]
 
 
 class TestWhenListed:

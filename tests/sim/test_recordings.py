@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import pytest
 
-from paramclient.model.px4_hash import hash_bits
-from paramclient.model.values import Encoding, Param, ParamType, Value, decode_value, encode_value, from_bits
+from paramclient.model.values import Encoding, ParamType, Value, decode_value, encode_value, from_bits
 from paramclient.protocol import param_pck
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam, ardupilot_table, px4_table
@@ -28,46 +27,6 @@ from tests.recordings import (
 PX4_HASH = 0xCF579589
 BAROMETER = ("CAL_BARO0_ID", "CAL_BARO0_OFF", "CAL_BARO0_PRIO")
 """Parameters that the recorded PX4 sets during boot, and saves only after the first change by a user."""
-
-
-def params(values: Iterable[messages.ParamValue], encoding: Encoding) -> list[Param]:
-    """Return the values of a full download, without the hash."""
-    found = []
-    for value in values:
-        if value.param_index != messages.NO_INDEX:
-            number, bits = decode_value(value.raw, value.param_type, encoding)
-            found.append(Param(value.param_id, number, value.param_type, value.param_index, bits))
-    return found
-
-
-class TestDecoding:
-    def test_px4s_table_and_hash(self) -> None:
-        values = param_values(from_vehicle("px4_full_download"))
-        first = next(at for at, value in enumerate(values) if value.param_id == messages.HASH_CHECK)
-        announced = values[first]
-        assert [value.param_id for value in values[:first]] == list(BAROMETER)
-        assert announced[1:] == (PX4_HASH.to_bytes(4, "little"), ParamType.UINT32, 903, messages.NO_INDEX)
-        found = params(values[first:], Encoding.BYTEWISE)
-        assert found == [
-            Param(row.name, row.value, row.type, index, row.bits) for index, row in enumerate(px4_table())
-        ]
-        assert len(found) == 903
-        assert {value.param_count for value in values} == {903}
-        volatile = [row.name for row in px4_table() if row.volatile]
-        assert len(volatile) == 58
-        bits = {each.name: each.bits for each in found}
-        assert hash_bits(bits, leave_out=volatile) == PX4_HASH
-        assert hash_bits(bits) != PX4_HASH
-
-    def test_ardupilots_table(self) -> None:
-        values = param_values(from_vehicle("ardupilot_full_download"))
-        found = params(values, Encoding.C_CAST)
-        assert len(found) == len(values) == 1382
-        assert found == [
-            Param(row.name, row.value, row.type, index, row.bits)
-            for index, row in enumerate(ardupilot_table())
-        ]
-        assert {value.param_count for value in values} == {1382}
 
 
 # Messages that a replay leaves out

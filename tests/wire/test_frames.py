@@ -273,31 +273,6 @@ def test_a_payload_may_be_longer_or_shorter_than_known(ours: Message, theirs: An
     assert decode(one_frame(bare_frame(number, b""))) is not None
 
 
-byte, word = st.integers(0, 255), st.integers(0, 65535)
-
-
-@thorough
-@given(
-    st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=16),
-    st.floats(width=32, allow_nan=False),
-    *(byte, word, word, st.sampled_from((1, 2)), byte),
-)
-def test_values_and_sets_of_every_kind_are_pymavlinks(
-    name: str, value: float, number: int, count: int, index: int, version: int, sequence: int
-) -> None:
-    raw, data = struct.pack("<f", value), name.encode()
-    to = count % 256, index % 256
-    ours: list[Message] = [ParamValue(name, raw, number, count, index), ParamSet(*to, name, raw, number)]
-    theirs = [
-        dialect.MAVLink_param_value_message(data, value, number, count, index),
-        dialect.MAVLink_param_set_message(*to, data, value, number),
-    ]
-    for our, their in zip(ours, theirs, strict=True):
-        frame = encode(our, system=7, component=8, sequence=sequence, version=version)
-        assert frame == pack(their, version=version, sequence=sequence)
-        assert decode(one_frame(frame)) == our
-
-
 def test_a_name_ends_at_its_first_nul_and_keeps_odd_bytes() -> None:
     payload = bytes(4) + b"\x01\0\x02\0" + b"A\xff\0GARBAGE".ljust(16, b"!") + b"\x06"
     value = decode(one_frame(bare_frame(22, payload)))

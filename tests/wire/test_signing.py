@@ -18,7 +18,6 @@ from paramclient.errors import UsageError
 from paramclient.wire.frames import Framer, checksum, sign_frame
 from paramclient.wire.messages import (
     Message,
-    ParamRequestList,
     ParamRequestRead,
     ParamValue,
     SetupSigning,
@@ -139,26 +138,6 @@ def test_keys_are_equal_by_their_bytes_and_distinguished_by_their_fingerprints()
 # Beside pymavlink
 
 
-@given(
-    timestamp=timestamps,
-    link_id=byte,
-    sequence=byte,
-    system=st.integers(1, 255),
-    component=st.integers(1, 255),
-    payload=st.binary(min_size=2, max_size=2),
-)
-def test_our_signatures(
-    timestamp: int, link_id: int, sequence: int, system: int, component: int, payload: bytes
-) -> None:
-    message = ParamRequestList(*payload)
-    frame = encode(message, system=system, component=component, sequence=sequence)
-    ours = sign_frame(frame, Signer(KEY, link_id=link_id, timestamp=timestamp - 1))
-    mav = pymavlink(system=system, timestamp=timestamp, link_id=link_id)
-    mav.srcComponent = component
-    mav.seq = sequence
-    assert ours == dialect.MAVLink_param_request_list_message(*payload).pack(mav)
-
-
 @given(timestamp=timestamps, link_id=byte, more=st.lists(st.integers(0, 10_000_000), max_size=5))
 def test_pymavlink_takes_what_we_sign_and_reversely(timestamp: int, link_id: int, more: list[int]) -> None:
     signer = Signer(KEY, link_id=link_id, timestamp=timestamp)
@@ -225,13 +204,6 @@ def test_the_timestamp_rises_from_frame_to_frame_and_with_the_time() -> None:
     assert used() == NOW + 5 * UNITS_PER_SECOND + 1
     signer.advance(52.0)
     assert used() == NOW + 5 * UNITS_PER_SECOND + 2
-
-
-def test_a_frame_of_mavlink_1_stays_as_it_is() -> None:
-    frame = encode(VALUE, system=1, component=1, sequence=0, version=1)
-    signer = Signer(KEY, timestamp=NOW)
-    assert sign_frame(frame, signer) == frame
-    assert signer.timestamp == NOW
 
 
 # What is refused
