@@ -42,7 +42,7 @@ async def download_file(session: Session) -> int:
     while attempts < DOWNLOADS_MAX:
         requested_at = anyio.current_time()
         try:
-            data, count = await _read(session, PARAM_FILE + query)
+            data, count = await _read(session, PARAM_FILE + query, requested_at)
             pack = decode(data)
         except FileTransferError as error:
             is_missing = error.code == FileErrorCode.FILE_NOT_FOUND
@@ -98,7 +98,7 @@ async def _count(session: Session) -> int | None:
     return None
 
 
-async def _read(session: Session, path: str) -> tuple[bytes, int | None]:
+async def _read(session: Session, path: str, requested_at: float) -> tuple[bytes, int | None]:
     """Read the file; beside it also the vehicle's number of parameters, if the table has another."""
     channel, known = session.channel, session.table.count
     total, count = known, None
@@ -109,8 +109,7 @@ async def _read(session: Session, path: str) -> tuple[bytes, int | None]:
 
     def begun(head: bytes) -> None:
         nonlocal total
-        with suppress(PackError):
-            total = decode_prefix(head)[0].total
+        total = _store_beginning(session, head, requested_at) or total  # others have first values then
         if known not in (None, total):
             tasks.start_soon(read_count)
 
@@ -126,14 +125,15 @@ async def _read(session: Session, path: str) -> tuple[bytes, int | None]:
     return data, count
 
 
-def _store_beginning(session: Session, prefix: bytes, requested_at: float) -> None:
-    """Store the whole entries of a file that was cut off."""
+def _store_beginning(session: Session, prefix: bytes, requested_at: float) -> int | None:
+    """Store the whole entries at the beginning of a file, and return the number of all parameters in it."""
     try:
         pack, number = decode_prefix(prefix)
     except PackError:
-        return
+        return None
     if pack.entries and number == pack.total and session.table.count in (None, number):
         _store(session, pack, requested_at)
+    return pack.total
 
 
 def _store(session: Session, pack: Pack, requested_at: float) -> None:
