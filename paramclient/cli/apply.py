@@ -50,10 +50,14 @@ class State:
 
     Attributes:
         params: the values.
+        is_restore: whether they are an earlier state of the vehicle.
+        partial: whether invalid values and unknown names are skipped.
         is_part: whether values are missing, so that the command cannot end as complete.
     """
 
     params: ParamSet
+    is_restore: bool = False
+    partial: bool = True
     is_part: bool = False
 
 
@@ -89,8 +93,8 @@ async def apply(
         metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for the
             ranges of values, and for parameters that take effect only after a reboot.
     """
-    load, options = await _from_file(file, options)
-    return await _run(url, options, load, metadata=metadata, partial=partial)
+    load, options = await _from_file(file, options, partial=partial)
+    return await _run(url, options, load, metadata)
 
 
 async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags = _OPTIONS) -> int:
@@ -112,8 +116,8 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
     """
     if when is not None and (is_file(when) or is_pattern_name(when)):
         check_pattern("the backup file", when, options)
-        load, options = await _from_file(when, options)
-        return await _run(url, options, load, is_restore=True)
+        load, options = await _from_file(when, options, is_restore=True)
+        return await _run(url, options, load)
     if options.place is False:
         raise errors.UsageError(
             "earlier states are in the cache, which --no-cache excludes; name a backup file"
@@ -123,7 +127,7 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
         moment = int(when) if _SNAPSHOT.fullmatch(when) else parse_time(when, time.time())
     if isinstance(moment, int) and ChosenVehicle.parse(options.vehicle).is_all:
         raise errors.UsageError(f"snapshot {when} is of one vehicle; with --vehicle all, give a time")
-    return await _run(url, options, bind(_earlier_state, moment), is_restore=True)
+    return await _run(url, options, bind(_earlier_state, moment))
 
 
 async def reset(
@@ -155,18 +159,23 @@ async def reset(
     chosen = check_given(names)
     load = bind(_defaults, chosen or ["*"], metadata, only_known=changed)
     flags = replace(options, include=(*options.include, *(name.upper() for name in chosen)))
-    return await _run(url, flags, load, metadata=metadata)
+    return await _run(url, flags, load, metadata)
 
 
 # The values to write
 
 
-async def _from_file(name: str, options: ApplyFlags) -> tuple[Load, ApplyFlags]:
+async def _from_file(name: str, options: ApplyFlags, **kind: bool) -> tuple[Load, ApplyFlags]:
     """Return what gives each vehicle its values of a file, and the options for the kind of its parameters.
 
     The file may also be a vehicle of the cache or a link; one with placeholders in its name is read for each
     vehicle. The values count as a vehicle's own if --vehicle or the name of the file has its hardware id, and
     the file has none.
+
+    Args:
+        name: the file.
+        options: the options of the subcommand.
+        kind: `partial` and `is_restore` of the state.
     """
     source: ParamFile | None = None
     if is_file(name):
@@ -186,7 +195,7 @@ async def _from_file(name: str, options: ApplyFlags) -> tuple[Load, ApplyFlags]:
         is_named = session.choice.uid is not None or (own.uid is not None and own.uid in params.source)
         if is_named and own.uid is not None and (origin is None or origin.uid is None):
             params = replace(params, identity=own if origin is None else replace(origin, uid=own.uid))
-        return State(params, is_part=file.left_out > 0)
+        return State(params, is_part=file.left_out > 0, **kind)
 
     is_extended = options.extended or (source is not None and source.is_extended)
     return load, replace(options, extended=is_extended)
@@ -208,7 +217,7 @@ async def _earlier_state(moment: float | int | None, session: CommandSession) ->
     read = bind(cache.state_at, *place, extended=vehicle.is_extended)
     try:
         if moment is not None:
-            return State(await anyio.to_thread.run_sync(read, moment))
+            return State(await anyio.to_thread.run_sync(read, moment), is_restore=True)
         point = await anyio.to_thread.run_sync(find)
     except errors.NotInCache:
         raise
@@ -219,7 +228,7 @@ async def _earlier_state(moment: float | int | None, session: CommandSession) ->
     when = f"{age_in_words(time.time() - point.at)} ago (snapshot {point.snapshot})"
     changed = listed([*point.changes]) or "nothing, as far as is known"
     say(f"{session.prefix}the state is that before the last apply, {when}; changed since then: {changed}")
-    return State(point.state)
+    return State(point.state, is_restore=True)
 
 
 async def _defaults(
@@ -255,15 +264,7 @@ async def _defaults(
 # Plans and writes
 
 
-async def _run(
-    url: str,
-    flags: ApplyFlags,
-    load: Load,
-    *,
-    metadata: MetadataChoice = None,
-    partial: bool = True,
-    is_restore: bool = False,
-) -> int:
+async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice = None) -> int:
     """Plan, ask, and write; print the plans or the results, also those so far after an interruption.
 
     Args:
@@ -271,8 +272,6 @@ async def _run(
         flags: the options of the subcommand.
         load: returns the values for a vehicle.
         metadata: the value of --metadata.
-        partial: whether invalid values and unknown names are skipped.
-        is_restore: whether the values are an earlier state of the vehicle.
 
     Returns:
         The exit code.
@@ -286,11 +285,11 @@ async def _run(
 
         async def prepare(session: CommandSession) -> None:
             state, include = await load(session), flags.include
-            if is_restore:
+            if state.is_restore:
                 say(f"{session.prefix}the state: {described(state.params)}")
                 include += await restore_categories(session.component, state.params)
             info = await known_of_session(session, metadata)
-            options = ApplyOptions(include=include, info=info, partial=partial, reboot=flags.reboot)
+            options = ApplyOptions(include=include, info=info, partial=state.partial, reboot=flags.reboot)
             options["allow_armed"] = flags.allow_armed
             if flags.backup is not None:
                 options["backup"] = path = await fill_pattern(flags.backup, session)
@@ -298,7 +297,7 @@ async def _run(
                     message = "exists already, or is the backup of another vehicle; choose another name"
                     raise errors.FileError(message, source=path)
                 backups.add(path)
-            jobs[session] = _Job(session, state, options, is_restore)
+            jobs[session] = _Job(session, state, options)
 
         await found.work(prepare)
         for error in found.errors.values():
@@ -324,7 +323,6 @@ class _Job:
         session: the vehicle.
         state: the values to write.
         options: the options of the run.
-        is_restore: whether the values are an earlier state of the vehicle.
         found: the plan; while it is written, the outcomes so far; and at the end the result.
     """
 
@@ -333,7 +331,6 @@ class _Job:
     session: CommandSession
     state: State
     options: ApplyOptions
-    is_restore: bool
     found: Rows = field(default_factory=lambda: Rows({}))
 
     async def make_plan(self) -> Self:
@@ -351,7 +348,7 @@ class _Job:
 
     async def write(self) -> Self:
         """Write, and return the job with its result."""
-        session, arrived = self.session, dict[str, ApplyRow]()
+        session, state, arrived = self.session, self.state, dict[str, ApplyRow]()
 
         def update(now: ApplyProgress) -> None:
             if now.row is not None:
@@ -367,7 +364,7 @@ class _Job:
         more = ApplyOptions(timeout=session.deadline.left(), progress=update, before_writing=announce)
         with Status(f"{title}: waiting for the first response", title) as status:
             self.found = await run_apply(
-                session.component, self.state.params, {**self.options, **more}, is_restore=self.is_restore
+                session.component, state.params, {**self.options, **more}, is_restore=state.is_restore
             )
         return self
 
