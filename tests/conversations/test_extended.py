@@ -140,19 +140,6 @@ async def test_the_refusal_of_another_stations_set_is_not_taken_for_ours() -> No
         assert session.table.params["CAM_MODE"].value == 2
 
 
-async def test_a_list_that_changes_removes_and_adds() -> None:
-    camera = Camera()
-    async with filming(camera) as (conversation, session):
-        await fetch_all(session)
-        camera.remove_ext_param("CAM_ISO")
-        camera.add_ext_param("CAM_GAIN", 3)
-        camera.add_ext_param("CAM_GAMMA", 1.5)
-        result = await fetch_all(session)
-        assert dict(result.params) == camera.ext_params
-        kinds = {each.name: each.kind for each in conversation.changes}
-        assert (kinds["CAM_ISO"], kinds["CAM_GAIN"]) == ("removed", "added")
-
-
 async def test_a_component_may_have_both_kinds_or_none() -> None:
     camera = Camera({"A": "text"}, plain={"A": 5})
     async with converse(Air([camera, PX4Vehicle()])) as conversation:

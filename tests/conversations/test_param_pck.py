@@ -6,19 +6,16 @@ import struct
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from paramclient.errors import PackError
-from paramclient.model.values import ParamType, from_bits
-from paramclient.protocol.param_pck import Pack, PackedParam, decode, encode
+from paramclient.model.values import from_bits
+from paramclient.protocol.param_pck import decode, encode
 from paramclient.sim import ardupilot_table
 from tests.recordings import DATA
 
 PLAIN = (DATA / "ardupilot_param.pck").read_bytes()
 WITH_DEFAULTS = (DATA / "ardupilot_param_withdefaults.pck").read_bytes()
 TABLE = Path(__file__).parents[2] / "paramclient" / "sim" / "tables" / "ardupilot.csv"
-KINDS = (ParamType.INT8, ParamType.INT16, ParamType.INT32, ParamType.REAL32)
 
 
 def packed(
@@ -80,27 +77,3 @@ def test_a_file_that_is_no_param_pck_is_an_error(data: bytes, words: str) -> Non
         decode(data)
     assert 0 <= caught.value.offset <= len(data)
     assert str(caught.value).endswith(f"(byte {caught.value.offset})")
-
-
-names = st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=16)
-
-
-@st.composite
-def entries(draw: st.DrawFn) -> PackedParam:
-    kind = draw(st.sampled_from(KINDS))
-    bits = st.integers(0, (1 << 8 * kind.size) - 1)
-    return PackedParam(draw(names), kind, draw(bits), draw(st.none() | bits))
-
-
-busy = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])  # whatever else the machine does
-tables = st.lists(entries(), max_size=40, unique_by=lambda each: each.name)
-
-
-@busy
-@given(tables, st.integers(1, 239), st.booleans(), st.integers(0, 5))
-def test_encoding_and_decoding(
-    rows: list[PackedParam], read_size: int, with_defaults: bool, more: int
-) -> None:
-    data = encode(rows, total=len(rows) + more, with_defaults=with_defaults, read_size=read_size)
-    kept = rows if with_defaults else [each._replace(default=None) for each in rows]
-    assert decode(data) == Pack(tuple(kept), len(rows) + more, with_defaults)

@@ -288,3 +288,7 @@ async def test_senseless_bodies_are_refused() -> None:
     async with browsing(generic()) as browser:
         for method, what, body in REFUSED:
             problem(await browser.request(method, f"{V}/{what}", json=body), 422, "invalid-request")
+        for body in ({"text": "no\0parameters"}, {"text": "{", "format": "json"}, {"base64": "###"}):
+            answer = await browser.post("/api/files", json=body)
+            assert answer.headers["content-type"] == "application/problem+json"
+            assert answer.status_code == 422, answer.text

@@ -59,16 +59,6 @@ async def test_a_file_with_a_name_that_no_vehicle_can_have_is_shown_and_not_appl
         assert vehicle.requests["PARAM_SET"] == 0
 
 
-@pytest.mark.parametrize(
-    "body", [{"text": "not\0a file of parameters"}, {"text": "{", "format": "json"}, {"base64": "###"}]
-)
-async def test_an_invalid_file_is_a_problem(body: dict[str, Any]) -> None:
-    async with service(generic()) as (_, browser):
-        answer = await browser.post("/api/files", json=body)
-        assert answer.status_code == 422, answer.text
-        assert answer.headers["content-type"] == "application/problem+json"
-
-
 async def test_a_plan_writes_nothing_and_an_apply_what_was_planned(cache: str) -> None:
     vehicle = generic()
     async with browsing(vehicle, cache=cache) as browser:
