@@ -16,6 +16,7 @@ from paramclient.client.core import ClientCore
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
 from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, NotDurable, ParamClientError, UsageError
+from paramclient.links import Link
 from paramclient.links.tlog import ReplayLink
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.paramset import ParamMap
@@ -84,8 +85,12 @@ class Owner(Protocol):
     """What a component and its callers use of its client; see `paramclient.client.client`."""
 
     core: ClientCore
+    link: Link
     policy: Policy
     watch_interval: float | None
+
+    @property
+    def components(self) -> Mapping[Address, Component]: ...
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = ...
