@@ -135,12 +135,9 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
             if not tables:
                 report(f"{each} has no parameters")
     if found or options.json:
-        members = ("autopilot", "params", "complete", "hash", "key")
-        rows = (
-            [Path(each["file"]).name, f"{each['system']}/{each['component']}", *map(each.get, members)]
-            for each in found
-        )
-        show({"tables": found}, ["file", "component", *members], rows, json=options.json)
+        members = ("file", "system", "component", "autopilot", "params", "complete", "hash", "key")
+        rows = ([*map(each.get, members)] for each in found)
+        show({"tables": found}, members, rows, json=options.json)
     return code
 
 
