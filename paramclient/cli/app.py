@@ -86,20 +86,19 @@ def on_end_signal(end: Callable[[int], object]) -> Iterator[None]:
         end: takes the signal number.
     """
     loop = asyncio.get_running_loop()
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
 
     def receive(number: int, _: FrameType | None) -> None:
         for each in _SIGNALS:
             signal.signal(each, signal.SIG_DFL)
         loop.call_soon_threadsafe(end, number)
 
-    for number in _SIGNALS:
-        signal.signal(number, receive)  # not by the event loop, which has no signal handlers on Windows
+    # not by the event loop, which has no signal handlers on Windows
+    before = [(number, signal.signal(number, receive)) for number in _SIGNALS]
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for each in before:
+            signal.signal(*each)
 
 
 async def _until_signal(work: Callable[[], Awaitable[int | None]]) -> int | None:
@@ -130,10 +129,9 @@ class _LogPrinter(logging.Handler):
 
 @contextmanager
 def _messages_shown(*, verbose: bool) -> Iterator[None]:
-    logger, handler = logging.getLogger("paramclient"), _LogPrinter()
-    level = logger.level
+    logger = logging.getLogger("paramclient")
+    level, handler = logger.level, _LogPrinter(logging.DEBUG if verbose else logging.WARNING)
     logger.addHandler(handler)
-    handler.setLevel(logging.DEBUG if verbose else logging.WARNING)
     logger.setLevel(logging.DEBUG if verbose else level)
     try:
         yield

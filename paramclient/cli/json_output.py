@@ -171,8 +171,7 @@ def fetch_json(
 ) -> JsonObject:
     """Return a fetch with these parameters."""
     return {
-        **taken(component, "system", "component", "autopilot"),
-        "uid": component.identity.uid,
+        **vehicle_json(component),
         **taken(result, "count", "received", "source"),
         "hash": hash_text(result.hash),
         **taken(result, "missing", "cached", "changed", "lost", "repeated"),
@@ -225,23 +224,21 @@ def diff_json(
     """
 
     def entry_json(entry: Difference) -> JsonObject:
-        params = {"left": entry.left, "right": entry.right, "base": entry.base}
-        sides = {
-            side: param and compared_json(param, metadata)
-            for (side, param), metadata in zip(params.items(), known, strict=True)
-        }
-        described = [metadata.find(entry.name) for metadata in known[:2] if metadata is not None]
-        units = next((info.units for info in described if info is not None and info.units), None)
+        params = (entry.left, entry.right, entry.base)
+        sides = [each and compared_json(each, metadata) for each, metadata in zip(params, known, strict=True)]
+        infos = [metadata.find(entry.name) for metadata in known[:2] if metadata is not None]
+        units = next((info.units for info in infos if info is not None and info.units), None)
         is_given = any(each and each.default is not None for each in (entry.left, entry.right))
         source = DefaultSource.VEHICLE if is_given else DefaultSource.METADATA
         return {
             "is": entry.status,
             "types_differ": entry.types_differ,
             "rounding": entry.is_rounding,
-            **sides,
-            **known_members(default_source=source if has_defaults and entry.base else None),
+            **dict(zip(("left", "right", "base"), sides, strict=True)),
             "changed_side": entry.changed_side,
-            **known_members(units=short_text(units)),
+            **known_members(
+                default_source=source if has_defaults and entry.base else None, units=short_text(units)
+            ),
         }
 
     base = outcome.base
@@ -281,24 +278,12 @@ def rows_json(rows: Iterable[ApplyRow]) -> JsonObject:
 
 
 def plan_json(plan: Plan, component: Component) -> JsonObject:
-    """Return the plan for a vehicle, without unchanged parameters."""
-
-    def step_json(row: ApplyRow) -> JsonObject:
-        value, kind = typed(row.wanted.settable, row.type)
-        assert row.before is not None, "only parameters that the vehicle has are set"
-        return {
-            "name": row.name,
-            "value": value_json(value, kind),
-            "type": ParamType(kind).name,
-            "before": value_json(row.before, kind),
-            "needs_reboot": row.needs_reboot,
-        }
-
+    """Return the plan for a vehicle, without unchanged parameters; the steps are names."""
     stages = [
-        {**taken(stage, "purpose", "reboot_first"), "steps": [step_json(row) for row in stage.rows]}
+        {**taken(stage, "purpose", "reboot_first"), "steps": [row.name for row in stage.rows]}
         for stage in plan.stages
     ]
-    found: JsonObject = {
+    return {
         **taken(component, "system", "component"),
         "dry_run": True,
         "counts": plan.counts,
@@ -307,11 +292,8 @@ def plan_json(plan: Plan, component: Component) -> JsonObject:
         "extra": len(plan.extra),
         "unchecked": len(plan.unchecked),
         "reboot_for": plan.reboot_for,
+        **known_members(firmware=plan.firmware_note or None),
     }
-    if plan.firmware_note:
-        file, vehicle = (version_text(each.firmware) for each in plan.firmware)
-        found["firmware"] = {"file": file, "vehicle": vehicle}
-    return found
 
 
 def apply_json(result: ApplyResult, component: Component) -> JsonObject:

@@ -24,6 +24,8 @@ _UNSIGNED: Final = KeyOptions()
 
 
 async def serve(
+    link: str,
+    /,
     *links: str,
     mavlink: tuple[str, ...] = (),
     listen: str = "127.0.0.1:8765",
@@ -43,7 +45,8 @@ async def serve(
     waiting requests, writes the cache and exits.
 
     Args:
-        links: The links, such as udpin:0.0.0.0:14550 or serial:/dev/ttyACM0:57600.
+        link: The link, such as udpin:0.0.0.0:14550 or serial:/dev/ttyACM0:57600.
+        links: Further links.
         mavlink: Endpoint for ground stations, such as udpin:14551, tcpin:5760, udpout:127.0.0.1:14550 or
             serial:/dev/ttyUSB0:57600, with the options ?readonly, ?sign=KEYFILE and ?trusted (may write to a
             signed vehicle without signing). Without an address, only this computer can connect. May be given
@@ -62,10 +65,8 @@ async def serve(
 
     if no_cache and cache is not None:
         raise UsageError("--cache and --no-cache exclude each other")
-    if not links:
-        raise UsageError("no link is given; name at least one, such as udpin:0.0.0.0:14550")
     hub = service.Hub(
-        links,
+        (link, *links),
         cache=not no_cache if cache is None else cache,
         mavlink=mavlink,
         listen_only=listen_only,
@@ -126,15 +127,9 @@ async def sim(
         signing_key: A file with the signing key: the vehicle signs its frames and requires signed ones.
     """
     kind, spec = parse_link(f"sim:{vehicle.removeprefix('sim:')}"), parse_link(link)
-    if spec.kind is LinkKind.SIM:
-        raise UsageError(
-            f"{spec.name} is itself a simulated vehicle; sim needs a link to other programs, such as "
-            "udpout:127.0.0.1:14550"
-        )
     real = create_link(spec)
-    options: dict[str, Any] = {"stream": real.is_stream}
-    if signing_key is not None:
-        options |= {"signing_key": read_key(signing_key), "signing_timestamp": timestamp_now()}
+    key = {} if signing_key is None else {"signing_key": read_key(signing_key)}
+    options: dict[str, Any] = {"stream": real.is_stream, "signing_timestamp": timestamp_now(), **key}
     async with task_group() as tasks:
         opened = await tasks.start(serve_endpoint, simulated(kind, **options).endpoint, real)
         where = f"speaks to {spec}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
@@ -10,7 +11,7 @@ from typing import Any, Final, Protocol, TypeVar
 
 import anyio
 
-from paramclient.cli.json_output import JsonObject
+from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import LinkOptions, TrafficOptions
 from paramclient.cli.output import (
     ExitCode,
@@ -65,19 +66,17 @@ class Deadline:
 
     def __init__(self, seconds: float | None, default: float | None = None) -> None:
         self._is_given, limit = seconds is not None, default if seconds is None else seconds
-        self._at = None if limit is None else anyio.current_time() + limit
+        self._at = math.inf if limit is None else anyio.current_time() + limit
 
     @property
     def heartbeat_timeout(self) -> float | None:
         """Seconds to wait for the first heartbeat of a vehicle."""
-        return self.left() if self._is_given else self.left(VEHICLE_TIMEOUT)
+        return self.left(math.inf if self._is_given else VEHICLE_TIMEOUT)
 
-    def left(self, at_most: float | None = None) -> float | None:
-        """Return the seconds left, at most `at_most`; 0 after the deadline; `at_most` without a deadline."""
-        if self._at is None:
-            return at_most
-        left = max(self._at - anyio.current_time(), 0.0)
-        return left if at_most is None else min(left, at_most)
+    def left(self, at_most: float = math.inf) -> float | None:
+        """Return the seconds left, at most `at_most`; 0 after the deadline; None for no limit."""
+        left = min(max(self._at - anyio.current_time(), 0.0), at_most)
+        return None if left == math.inf else left
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +134,7 @@ class CommandSession:
     @property
     def ids(self) -> JsonObject:
         """The address as members of JSON."""
-        return {"system": self.component.system, "component": self.component.component}
+        return taken(self.component, "system", "component")
 
     @property
     def label(self) -> str:
@@ -269,11 +268,8 @@ class Sessions(list[CommandSession]):
         found = results.items()
         if not self[0].options.json:
             is_named = self.is_all or bool(self.others)
-            rows = [
-                (session.address if is_named else None, *cells)
-                for session, result in found
-                for cells in result.rows()
-            ]
+            named = [(session.address if is_named else None, result) for session, result in found]
+            rows = [(address, *cells) for address, result in named for cells in result.rows()]
             if rows:
                 print_table(["vehicle", *next(iter(results.values())).columns], rows)
         elif self.is_all:
@@ -302,10 +298,8 @@ class Sessions(list[CommandSession]):
         For subcommands that only read: they use the first vehicle heard, which may be another one next time.
         """
         if self.others:
-            report(
-                f"{self[0].label} was used, the first vehicle heard. Also on this link: "
-                f"{listed(self.others)}. --vehicle chooses one"
-            )
+            used = f"{self[0].label} was used, the first vehicle heard"
+            report(f"{used}. Also on this link: {listed(self.others)}. --vehicle chooses one")
 
 
 @asynccontextmanager
@@ -328,13 +322,9 @@ async def sessions(
     """
     choice, deadline = ChosenVehicle.parse(options.vehicle), Deadline(options.timeout)
     is_log = url.lower().startswith(f"{LinkKind.REPLAY}:")
-    async with _client(
-        f"{url}?speed=0" if is_log and not is_live and "?speed=" not in url else url,
-        options,
-        cache=options.place,
-        encoding=options.encoding,
-        listen_only=options.listen_only,
-    ) as client:
+    link = f"{url}?speed=0" if is_log and not is_live and "?speed=" not in url else url
+    more = {"encoding": options.encoding, "listen_only": options.listen_only}
+    async with _client(link, options, cache=options.place, **more) as client:
         if choice.is_all:
             with _waiting(client, "vehicles"):
                 found = await client.find_autopilots(timeout=deadline.heartbeat_timeout)
@@ -347,8 +337,7 @@ async def sessions(
                 raise NoReply("a component with extended parameters", attempts=0, waited=OTHERS_TIMEOUT)
         else:
             found = [await wait_for_vehicle(client, choice, deadline, only=writes)]
-            if options.extended:
-                found = [each.ext for each in found]
+            found = [each.ext for each in found] if options.extended else found
         if writes:
             await wait_for_firmware(found, deadline)
         for each in found:

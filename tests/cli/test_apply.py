@@ -183,7 +183,8 @@ def test_dry_run_prints_the_stages_in_order(command: Command, put: Put, file: Fi
     assert not backup.exists()
 
     reported = command("apply", put(vehicle), wanted, "--dry-run", "--json").json
-    planned = [(step["name"], step["value"]) for stage in reported["stages"] for step in stage["steps"]]
+    steps = [name for stage in reported["stages"] for name in stage["steps"]]
+    planned = [(name, reported["params"][name]["wanted"]) for name in steps]
     assert planned == [("EK2_ENABLE", 1), ("RTL_ALT", 2500), ("WPNAV_SPEED", 750.5)]
     assert (reported["dry_run"], reported["reboot_for"]) == (True, ["EK2_ENABLE"])
 

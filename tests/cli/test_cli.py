@@ -380,7 +380,6 @@ def test_link_is_live_on_a_terminal() -> None:
         (["get", "sim:px4", "SEVENTEEN_LETTERS", "--no-cache"], "SEVENTEEN_LETTERS"),
         (["set", "sim:px4"], "pairs"),
         (["watch", "sim:px4", "ÄÖÜ"], "ASCII"),
-        (["sim", "px4", "--link", "sim:px4"], "itself a simulated vehicle"),
         (["history"], "VEHICLE"),
     ],
 )

@@ -97,7 +97,7 @@ async def test_it_wants_a_token_of_its_file(tmp_path: Path) -> None:
         (2, ["sim:px4", "--tokens", "no-such-file"], "no-such-file"),
         (2, ["sim:px4", "--cache", "a", "--no-cache"], "exclude"),
         (2, ["sim:px4", "sim:px4"], "twice"),
-        (2, [], "link"),
+        (2, [], "LINK"),
         (
             4,
             ["sim:px4", "--listen", "127.0.0.1:0", "--mavlink", "tcpin:192.0.2.1:5760"],

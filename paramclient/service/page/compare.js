@@ -287,7 +287,7 @@ const PHASES = { reading: "Reading", writing: "Writing", rebooting: "Rebooting" 
 /** Returns the rows of a plan in the order of writing, then the skipped ones. */
 function linesOf(plan, table, other, refresh) {
   const staged = plan.stages.flatMap(({ purpose, steps }) =>
-    steps.map(({ name }) => [name, purpose === "all other parameters" ? "" : purpose]),
+    steps.map((name) => [name, purpose === "all other parameters" ? "" : purpose]),
   );
   const purposes = new Map(staged);
   const names = [...purposes.keys(), ...Object.keys(plan.params).filter((name) => !purposes.has(name))];
