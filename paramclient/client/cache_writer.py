@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -43,7 +43,7 @@ T = TypeVar("T")
 
 
 @dataclass(eq=False)
-class _Record:
+class TableRecord:
     """What the cache has of one table, and what is to be written of it.
 
     Attributes:
@@ -55,7 +55,7 @@ class _Record:
         fetched_at: likewise in this session, by the clock of the event loop.
     """
 
-    generation: int
+    generation: int = 0
     changes: list[tuple[Change, float]] = field(default_factory=list)
     is_whole: bool = False
     synced_at: float | None = None
@@ -88,7 +88,7 @@ class CacheWriter:
         self._thread = anyio.CapacityLimiter(1)
         self._identities: dict[Node, Identity] = {}  # of the vehicle, under which tables are written
         self._vehicles: dict[Node, Node] = {}  # the autopilot with this identity
-        self._records: dict[Session, _Record] = {}
+        self._records: dict[Session, TableRecord] = {}
         self._writing = anyio.Lock()
         self._is_closing = False
         self._has_written = False  # so the cache is one that can be written
@@ -189,7 +189,7 @@ class CacheWriter:
             if vehicle.identification.autopilot is None:  # no heartbeat yet
                 known = cached.identity
                 identity = replace(identity, autopilot=known.autopilot, vehicle_type=known.vehicle_type)
-            self._records.setdefault(session, _Record(node.generation)).synced_at = cached.synced_at
+            self._records.setdefault(session, TableRecord(node.generation)).synced_at = cached.synced_at
             is_same_firmware = _firmware(cached.identity) == _firmware(identity)
             params, ahead, now = cached.params.values(), self._seconds_ahead(), anyio.current_time()
             session.table.load(
@@ -230,7 +230,7 @@ class CacheWriter:
         record.is_whole |= is_whole
         self._wake()
 
-    def _record(self, node: Node, session: Session) -> _Record:
+    def _record(self, node: Node, session: Session) -> TableRecord:
         """Return the record of a table.
 
         What was received of an unidentified component before it was lost may be of another vehicle.
@@ -238,7 +238,7 @@ class CacheWriter:
         record = self._records.get(session)
         is_doubtful = record is not None and record.generation != node.generation
         if record is None or (is_doubtful and node not in self._identities):
-            record = self._records[session] = _Record(node.generation)
+            record = self._records[session] = TableRecord(node.generation)
         return record
 
     async def run(self) -> None:
@@ -318,22 +318,16 @@ class CacheWriter:
         """Return whether the vehicle and the component are still those that were identified."""
         return node.identification.is_confirmed and self._vehicles[node].identification.is_confirmed
 
-    def _update(self, node: Node, session: Session, record: _Record) -> TableUpdate:
+    def _update(self, node: Node, session: Session, record: TableRecord) -> TableUpdate:
         vehicle = self._vehicles[node]
         identity, heard = self._identities[node], vehicle.identification
         if heard.autopilot is not None:
             identity = replace(identity, autopilot=heard.autopilot, vehicle_type=heard.vehicle_type or 0)
-        ahead = self._seconds_ahead()
         return update_of(
-            node,
-            session,
-            identity,
-            record.changes,
+            *(node, session, identity, record),
             autopilot=identity.autopilot if node is vehicle else node.identification.autopilot or 0,
             at=time.time(),
-            synced_at=record.synced_at if record.fetched_at is None else record.fetched_at + ahead,
-            is_whole=record.is_whole,
-            ahead=ahead,
+            ahead=self._seconds_ahead(),
         )
 
     def _seconds_ahead(self) -> float:
@@ -372,12 +366,10 @@ def update_of(
     node: Node,
     session: Session,
     identity: Identity,
-    changes: Iterable[tuple[Change, float]],
+    record: TableRecord,
     *,
     autopilot: int,
     at: float,
-    synced_at: float | None,
-    is_whole: bool,
     ahead: float = 0.0,
 ) -> TableUpdate:
     """Return the update with which the cache takes a table.
@@ -385,12 +377,10 @@ def update_of(
     Args:
         node, session: the component and its parameters.
         identity: of its vehicle.
-        changes: changed parameters in order, each with its time.
+        record: of the table.
         autopilot: MAV_AUTOPILOT of the component.
         at: time of the update, in unix seconds.
-        synced_at: time of the last verification of the table, likewise, or None.
-        is_whole: whether all parameters of the table follow the changes.
-        ahead: seconds from the times of the table and of the changes to unix time.
+        ahead: seconds from the times of the table and of the record to unix time.
     """
     table = session.table
 
@@ -403,16 +393,16 @@ def update_of(
 
     params = [
         StoredParam.gone(each.name, unix(moment)) if each.new is None else observed(each.new, moment, each.by)
-        for each, moment in changes
+        for each, moment in record.changes
     ]
-    if is_whole:
+    if record.is_whole:
         params += [observed(param, table.moments[name]) for name, param in table.params.items()]
     state = TableState(
         hash=table.hash if table.is_complete else None,
         count=table.count,
         complete=table.is_complete,
         volatile_known=table.volatile_is_known,
-        synced_at=synced_at,
+        synced_at=record.synced_at if record.fetched_at is None else record.fetched_at + ahead,
         file_works=session.serves_file,
     )
     return TableUpdate(
@@ -422,7 +412,7 @@ def update_of(
         at=at,
         table=state,
         params=params,
-        replace=is_whole and table.is_complete,
+        replace=record.is_whole and table.is_complete,
         extended=session is node.extended,
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import defaultdict
 from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ import anyio.lowlevel
 import anyio.to_thread
 
 from paramclient.cache import ParamCache, StoredParam, TableUpdate
-from paramclient.client.cache_writer import update_of
+from paramclient.client.cache_writer import TableRecord, update_of
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import AUTOPILOT, LogFormat
 from paramclient.links.tlog import LOG_PEER, Record, open_log, read_records
@@ -118,8 +119,8 @@ class _Import:
         self._introductions = introductions
         self._cache = cache
         self._at = 0.0
-        self._changes: dict[Session, list[tuple[Change, float]]] = {}
-        self._complete_at: dict[Session, float] = {}
+        self._tables: defaultdict[Session, TableRecord]
+        self._tables = defaultdict(partial(TableRecord, is_whole=True))
         self._station = Station(
             link=name,
             is_stream=False,
@@ -153,22 +154,18 @@ class _Import:
                 self._station.receive(frame, LOG_PEER, self._at)
 
     def _take_change(self, session: Session, change: Change) -> None:
-        if session.table.is_complete:
-            self._complete_at.setdefault(session, self._at)
-        self._changes.setdefault(session, []).append((change, self._at))
+        table = self._tables[session]
+        if session.table.is_complete and table.synced_at is None:
+            table.synced_at = self._at
+        table.changes.append((change, self._at))
 
     def _update(self, node: Node, session: Session) -> TableUpdate:
         session.confirm_announced()
-        return update_of(
-            node,
-            session,
-            self._identity_of(node),
-            self._changes.get(session, ()),
-            autopilot=node.identification.autopilot or 0,
-            at=node.presence.received_at,
-            synced_at=self._complete_at.get(session) if session.table.is_complete else None,
-            is_whole=True,
-        )
+        table, autopilot = self._tables[session], node.identification.autopilot or 0
+        if not session.table.is_complete:
+            table.synced_at = None
+        at = node.presence.received_at
+        return update_of(node, session, self._identity_of(node), table, autopilot=autopilot, at=at)
 
     def _identity_of(self, node: Node) -> Identity:
         """Return the identity of a component's vehicle."""
