@@ -42,8 +42,9 @@ def every_kind() -> dict[str, WrittenParam]:
     return params | {param.name: param for param in more}
 
 
-def document(params: object) -> str:
-    return json.dumps({"paramclient": 1, "sets": [{"extended": True, "params": params}]})
+def of(fields: object) -> list[object]:
+    """The sets of a document with these fields of one extended parameter."""
+    return [{"extended": True, "params": {"CAM": fields}}]
 
 
 def read(path: Path) -> ParamSet:
@@ -80,41 +81,26 @@ def test_a_file_is_of_one_kind(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        ({"value": 1}, "an extended parameter has a type"),
-        ({"value": "one", "type": "UINT8"}, "expected a number"),
-        ({"value": 1, "type": "CUSTOM"}, "should be text, found 1"),
-        ({"value": "x" * 129, "type": "CUSTOM"}, "129 bytes"),
-        ({"value": "hex:0", "type": "CUSTOM"}, "non-hexadecimal"),
-        ({"value": "hex:" + "00" * 129, "type": "CUSTOM"}, "129 bytes"),
-        ({"value": "0x00000102", "type": "INT32"}, "raw bytes only if MAVLink does not define it"),
-        ({"value": 5, "type": "TYPE_77"}, "TYPE_77 is not a type that MAVLink defines"),
-    ],
-)
-def test_an_invalid_file_is_an_error_with_its_path(tmp_path: Path, fields: object, words: str) -> None:
-    path = tmp_path / "camera.json"
-    path.write_text(document({"CAM": fields}))
-    with pytest.raises(FileError, match=words) as caught:
-        read_file(path)
-    assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize(
     ("sets", "words"),
     [
+        (of({"value": 1}), "an extended parameter has a type"),
+        (of({"value": "one", "type": "UINT8"}), "expected a number"),
+        (of({"value": 1, "type": "CUSTOM"}), "should be text, found 1"),
+        (of({"value": "x" * 129, "type": "CUSTOM"}), "129 bytes"),
+        (of({"value": "hex:0", "type": "CUSTOM"}), "non-hexadecimal"),
+        (of({"value": "hex:" + "00" * 129, "type": "CUSTOM"}), "129 bytes"),
+        (of({"value": "0x00000102", "type": "INT32"}), "raw bytes only if MAVLink does not define it"),
+        (of({"value": 5, "type": "TYPE_77"}), "TYPE_77 is not a type that MAVLink defines"),
         ([{"extended": 1, "params": {}}], "should be true or false, found 1"),
         ([{"params": {"A": TEXT}}], "a plain parameter is a number"),
         ([{"params": {"A": {"value": "0x0000000102", "type": "INT8"}}}], "or four raw bytes"),
         (
-            [
-                {"params": {"A": {"value": 1}}},
-                {"extended": True, "params": {"A": {"value": 1, "type": "INT8"}}},
-            ],
+            [{"params": {"A": {"value": 1}}}, *of({"value": 1, "type": "INT8"})],
             "either plain or extended parameters, not both",
         ),
     ],
 )
-def test_documents_of_the_wrong_kind(sets: list[object], words: str) -> None:
-    with pytest.raises(FileError, match=words):
-        loads(json.dumps({"paramclient": 1, "sets": sets}).encode())
+def test_an_invalid_document_is_an_error_with_its_name(sets: list[object], words: str) -> None:
+    with pytest.raises(FileError, match=words) as caught:
+        loads(json.dumps({"paramclient": 1, "sets": sets}).encode(), source="camera.json")
+    assert caught.value.source == "camera.json"

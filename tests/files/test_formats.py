@@ -382,33 +382,28 @@ KINDS = {
     "a start script of PX4": "#!/bin/sh\n. ${R}etc/init.d/rc.mc_defaults\nparam set-default MC_ROLL_P 6.5\n",
     "a script that sets no parameter": "#!/bin/sh\n. ${R}etc/init.d-posix/airframes/4001_gz_x500\n",
     "a list with a third column": "A 1 1\nB 2.5 3\n",
+    "parameter storage of PX4 (BSON)": b"\x14\0\0\0\x10MC_ROLL_P\0\1\0\0\0\0",
+}
+RECORDED = {
+    "parameters.json": "not a parameter file: metadata of parameters",
+    "apm.pdef.json": "not a parameter file: metadata of parameters",
+    "apm.pdef.xml": "not a parameter file: metadata of parameters",
+    "ardupilot_flight.bin": "not a parameter file: an on-board log of ArduPilot",
+    "px4_flight.ulg": "not a parameter file: an on-board log of PX4",
+    "px4_get_set.tlog": "not a parameter file: a telemetry log",
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_file_of_another_program_is_named(kind: str) -> None:
-    error = failed(KINDS[kind])
-    assert (kind in str(error), error.line, len(str(error).splitlines())) == (True, None, 1), str(error)
-
-
 @pytest.mark.parametrize(
-    ("name", "kind"),
+    ("data", "kind"),
     [
-        ("parameters.json", "metadata of parameters"),
-        ("apm.pdef.json", "metadata of parameters"),
-        ("apm.pdef.xml", "metadata of parameters"),
-        ("ardupilot_flight.bin", "an on-board log of ArduPilot"),
-        ("px4_flight.ulg", "an on-board log of PX4"),
-        ("px4_get_set.tlog", "a telemetry log"),
+        *((data, kind) for kind, data in KINDS.items()),
+        *((DATA / name, kind) for name, kind in RECORDED.items()),
     ],
 )
-def test_a_recorded_file_of_another_kind_is_named(name: str, kind: str) -> None:
-    assert f"quad.x: not a parameter file: {kind}" in str(failed((DATA / name).read_bytes()))
-
-
-def test_the_parameter_storage_of_px4_is_named() -> None:
-    bson = b"\x10MC_ROLL_P\0\1\0\0\0\0"
-    assert "parameter storage of PX4 (BSON)" in str(failed((len(bson) + 4).to_bytes(4, "little") + bson))
+def test_a_file_of_another_program_is_named(data: bytes | str | Path, kind: str) -> None:
+    error = failed(data.read_bytes() if isinstance(data, Path) else data)
+    assert (kind in str(error), error.line, len(str(error).splitlines())) == (True, None, 1), str(error)
 
 
 def test_a_comment_in_another_encoding_is_read() -> None:

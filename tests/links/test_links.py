@@ -452,13 +452,6 @@ async def test_a_port_in_use_is_a_link_error_until_it_is_free(kind: str) -> None
 
 
 @pytest.mark.asyncio
-@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
-async def test_listening_needs_an_address_of_this_computer(kind: str) -> None:
-    with pytest.raises(LinkError, match=r"192\.0\.2\.1 is not an address of this computer"):
-        await create_link(f"{kind}:192.0.2.1:0").open()
-
-
-@pytest.mark.asyncio
 async def test_udpout_receives_only_from_its_target_and_keeps_its_port() -> None:
     with udp_socket() as vehicle:
         async with opened(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}") as link:
@@ -521,6 +514,8 @@ async def test_a_burst_waits_for_a_late_reader(kind: str) -> None:
 @pytest.mark.parametrize(
     ("name", "text"),
     [
+        ("udpin:192.0.2.1:0", r"192\.0\.2\.1 is not an address of this computer"),
+        ("tcpin:192.0.2.1:0", r"192\.0\.2\.1 is not an address of this computer"),
         ("udpout:[fe80::1]:14550", "cannot open: "),
         ("tcp:255.255.255.255:5760", "no route to 255.255.255.255:5760: .* in the network of the vehicle"),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import struct
+from dataclasses import fields
 from itertools import pairwise
 from typing import Any
 
@@ -39,6 +40,7 @@ from paramclient.wire.messages import (
     SystemTime,
     decode,
     encode,
+    message_id,
 )
 from paramclient.wire.signing import SigningKey
 from tests.recordings import read
@@ -113,81 +115,67 @@ def take(framer: Framer, chunks: list[bytes]) -> list[Frame]:
 
 # Messages
 
-NAME = b"SIXTEEN_LETTERS_"
+NAME = "SIXTEEN_LETTERS_"
 PACKED_FLOAT = struct.pack("<f", 6.5)
-MESSAGES: list[tuple[Message, Any]] = [
-    (Heartbeat(2, 12, 81, 0x01020304, 4, 3), dialect.MAVLink_heartbeat_message(2, 12, 81, 0x01020304, 4, 3)),
-    (
-        AutopilotVersion(
-            64495, 0x01110040, b"git hash", 9, 10, 11, 0xFEDCBA9876543210, b"eighteen bytes uid"
-        ),
-        dialect.MAVLink_autopilot_version_message(
-            64495, 0x01110040, 0, 0, 9, b"git hash", bytes(8), bytes(8), 10, 11, 0xFEDCBA9876543210,
-            b"eighteen bytes uid",
-        ),
-    ),
-    (
-        CommandLong(1, 2, 512, 148.0, 0.5, 0.0, -1.0, 0.0, 0.0, 3.0, 1),
-        dialect.MAVLink_command_long_message(1, 2, 512, 1, 148.0, 0.5, 0.0, -1.0, 0.0, 0.0, 3.0),
-    ),
-    (CommandAck(512, 3, 255, 190), dialect.MAVLink_command_ack_message(512, 3, 0, 0, 255, 190)),
-    (
-        ParamRequestRead(1, 2, "MC_ROLL_P"),
-        dialect.MAVLink_param_request_read_message(1, 2, b"MC_ROLL_P", -1),
-    ),
-    (ParamRequestRead(1, 0, "", 903), dialect.MAVLink_param_request_read_message(1, 0, b"", 903)),
-    (ParamRequestList(1, 0), dialect.MAVLink_param_request_list_message(1, 0)),
-    (
-        ParamValue("MC_ROLL_P", PACKED_FLOAT, 9, 903, 441),
-        dialect.MAVLink_param_value_message(b"MC_ROLL_P", 6.5, 9, 903, 441),
-    ),
-    (
-        ParamValue(NAME.decode(), struct.pack("<f", -0.0), 9, 65535, 65535),
-        dialect.MAVLink_param_value_message(NAME, -0.0, 9, 65535, 65535),
-    ),
-    (ParamValue("", bytes(4), 0, 0, 0), dialect.MAVLink_param_value_message(b"", 0.0, 0, 0, 0)),
-    (
-        ParamSet(1, 2, NAME.decode(), PACKED_FLOAT, 6),
-        dialect.MAVLink_param_set_message(1, 2, NAME, 6.5, 6),
-    ),
-    (StatusText(4, "write denied (A)"), dialect.MAVLink_statustext_message(4, b"write denied (A)")),
-    (StatusText(6, "x" * 50), dialect.MAVLink_statustext_message(6, b"x" * 50)),
-    (ParamError(255, 190, "A", -1, 5), dialect.MAVLink_param_error_message(255, 190, b"A", -1, 5)),
-    (ParamError(0, 0, "", 7, 1), dialect.MAVLink_param_error_message(0, 0, b"", 7, 1)),
-    (
-        ParamExtRequestRead(1, 100, "CAM_MODE"),
-        dialect.MAVLink_param_ext_request_read_message(1, 100, b"CAM_MODE", -1),
-    ),
-    (ParamExtRequestRead(1, 0, "", 7), dialect.MAVLink_param_ext_request_read_message(1, 0, b"", 7)),
-    (ParamExtRequestList(1, 100), dialect.MAVLink_param_ext_request_list_message(1, 100)),
-    (
-        ParamExtValue(NAME.decode(), bytes(range(1, 129)), 11, 300, 299),
-        dialect.MAVLink_param_ext_value_message(NAME, bytes(range(1, 129)), 11, 300, 299),
-    ),
-    (
-        ParamExtSet(1, 100, "CAM_MODE", b"\x05".ljust(128, b"\0"), 5),
-        dialect.MAVLink_param_ext_set_message(1, 100, b"CAM_MODE", b"\x05", 5),
-    ),
-    (
-        ParamExtAck("CAM_MODE", b"text".ljust(128, b"\0"), 11, 3),
-        dialect.MAVLink_param_ext_ack_message(b"CAM_MODE", b"text", 11, 3),
-    ),
-    (SystemTime(2**40 + 1, 2**31 + 2), dialect.MAVLink_system_time_message(2**40 + 1, 2**31 + 2)),
-    (HighLatency2(2, 12), dialect.MAVLink_high_latency2_message(0, 2, 12, *[0] * 24)),
-    (
-        SetupSigning(1, 2, SigningKey(bytes(range(32))), 2**40 + 3),
-        dialect.MAVLink_setup_signing_message(1, 2, list(range(32)), 2**40 + 3),
-    ),
-    (SetupSigning(1, 2, None, 0), dialect.MAVLink_setup_signing_message(1, 2, [0] * 32, 0)),
-    (
-        FileTransfer(0, 1, 2, bytes(range(1, 252))),
-        dialect.MAVLink_file_transfer_protocol_message(0, 1, 2, bytes(range(1, 252))),
-    ),
-    (
-        FileTransfer(3, 255, 190, b"\x02" + bytes(250)),
-        dialect.MAVLink_file_transfer_protocol_message(3, 255, 190, b"\x02" + bytes(250)),
-    ),
-]  # fmt: skip
+SENT: list[Message] = [
+    Heartbeat(2, 12, 81, 0x01020304, 4, 3),
+    AutopilotVersion(64495, 0x01110040, b"git hash", 9, 10, 11, 0xFEDCBA9876543210, b"eighteen bytes uid"),
+    CommandLong(1, 2, 512, 148.0, 0.5, 0.0, -1.0, 0.0, 0.0, 3.0, 1),
+    CommandAck(512, 3, 255, 190),
+    ParamRequestRead(1, 2, "MC_ROLL_P"),
+    ParamRequestRead(1, 0, "", 903),
+    ParamRequestList(1, 0),
+    ParamValue("MC_ROLL_P", PACKED_FLOAT, 9, 903, 441),
+    ParamValue(NAME, struct.pack("<f", -0.0), 9, 65535, 65535),
+    ParamValue("", bytes(4), 0, 0, 0),
+    ParamSet(1, 2, NAME, PACKED_FLOAT, 6),
+    StatusText(4, "write denied (A)"),
+    StatusText(6, "x" * 50),
+    ParamError(255, 190, "A", -1, 5),
+    ParamError(0, 0, "", 7, 1),
+    ParamExtRequestRead(1, 100, "CAM_MODE"),
+    ParamExtRequestRead(1, 0, "", 7),
+    ParamExtRequestList(1, 100),
+    ParamExtValue(NAME, bytes(range(1, 129)), 11, 300, 299),
+    ParamExtSet(1, 100, "CAM_MODE", b"\x05".ljust(128, b"\0"), 5),
+    ParamExtAck("CAM_MODE", b"text".ljust(128, b"\0"), 11, 3),
+    SystemTime(2**40 + 1, 2**31 + 2),
+    HighLatency2(2, 12),
+    SetupSigning(1, 2, SigningKey(bytes(range(32))), 2**40 + 3),
+    SetupSigning(1, 2, None, 0),
+    FileTransfer(0, 1, 2, bytes(range(1, 252))),
+    FileTransfer(3, 255, 190, b"\x02" + bytes(250)),
+]
+RENAMED = {"raw": "param_value", "git_hash": "flight_custom_version", "key": "secret_key"}
+"""Fields that have another name here than in the standard."""
+
+
+def of_pymavlink(number: int, **given: Any) -> Any:
+    """A message of pymavlink with these fields; all others are zero."""
+    kind = dialect.mavlink_map[number]
+    lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
+    blank = {
+        name: b"" if field == "char" else [0] * lengths[name] if lengths[name] else 0
+        for name, field in zip(kind.fieldnames, kind.fieldtypes, strict=True)
+    }
+    return kind(**blank | given)
+
+
+def theirs_of(ours: Message) -> Any:
+    """The same message of pymavlink."""
+    names = ours._fields if isinstance(ours, tuple) else [each.name for each in fields(ours)]
+    given = {RENAMED.get(name, name): getattr(ours, name) for name in names}
+    for name, value in given.items():
+        if isinstance(value, str):
+            given[name] = value.encode()
+        elif name == "secret_key":
+            given[name] = [0] * 32 if value is None else list(range(32))
+        elif name == "param_value" and len(value) == 4:
+            (given[name],) = struct.unpack("<f", value)
+    return of_pymavlink(message_id(type(ours)), **given)
+
+
+MESSAGES = [(ours, theirs_of(ours)) for ours in SENT]
 MAVLINK_2_ONLY = (
     *(ParamError, SetupSigning),
     *(ParamExtRequestRead, ParamExtRequestList, ParamExtValue, ParamExtSet, ParamExtAck),
@@ -455,19 +443,8 @@ def test_in_datagrams_every_whole_frame_is_found(mixes: list[list[bytes]]) -> No
 @pytest.mark.parametrize("number", sorted(BOOT_CLOCK_OFFSETS))
 def test_the_position_of_time_boot_ms_in_each_message(number: int) -> None:
     """pymavlink packs each message that has it; in the payload its trailing zeros are cut off."""
-    kind = dialect.mavlink_map[number]
     for boot_ms in (0xA1B2C3D4, 0x00000017):
-        fields = {
-            name: (b"" if field == "char" else [0] * length if length else 0)
-            for name, field, length in zip(
-                kind.ordered_fieldnames,
-                (kind.fieldtypes[kind.fieldnames.index(name)] for name in kind.ordered_fieldnames),
-                kind.array_lengths,
-                strict=True,
-            )
-        }
-        packed = kind(**fields | {"time_boot_ms": boot_ms}).pack(dialect.MAVLink(None, 1, 1))
-        (frame,) = Framer(stream=False).receive(bytes(packed))
+        frame = one_frame(pack(of_pymavlink(number, time_boot_ms=boot_ms)))
         at = BOOT_CLOCK_OFFSETS[number]
         assert int.from_bytes(frame.payload[at : at + 4], "little") == boot_ms
 
