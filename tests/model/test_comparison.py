@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from paramclient.model.comparison import (
     ChangedSide,
-    Comparison,
     DifferenceStatus,
     compare,
     defaults_of,
@@ -149,17 +148,6 @@ def test_a_different_type_is_not_a_different_value() -> None:
     )
     assert outcome.is_same
     assert [entry.types_differ for entry in outcome.entries] == [True, False]
-
-
-def names_of(outcome: Comparison) -> list[str]:
-    return [entry.name for entry in outcome.entries]
-
-
-def test_names_can_be_selected_by_patterns() -> None:
-    left, right = of(MC_ROLL_P=1, MC_YAW_P=1, BAT_N=1), of(MC_ROLL_P=1, MC_PITCH_P=1)
-    assert names_of(compare(left, right, names=["MC_*_P"])) == ["MC_PITCH_P", "MC_ROLL_P", "MC_YAW_P"]
-    assert names_of(compare(left, right, names=["MC_ROLL_P", "BAT_?"])) == ["BAT_N", "MC_ROLL_P"]
-    assert compare(left, right, names="MC_ROLL_P").is_same
 
 
 def test_defaults_of_leaves_out_unknown_and_differing_defaults() -> None:

@@ -1,10 +1,10 @@
-"""Suggestions for names that nothing has: in mappings, selections and sentences."""
+"""Suggestions for names that nothing has."""
 
 from __future__ import annotations
 
 import pytest
 
-from paramclient.model.names import NameChoice, nearest_names
+from paramclient.model.names import nearest_names
 
 NAMES = ["MC_YAWRATE_P", "MC_YAW_P", "MC_ROLL_P", "MC_ROLLRATE_P", "MPC_XY_P", "ringBuffer"]
 
@@ -28,11 +28,3 @@ def test_a_name_is_not_suggested_for_itself_and_nothing_for_an_unlike_one() -> N
     assert nearest_names("BATTERY", NAMES) == ()
     assert nearest_names("BATTERY", []) == ()
     assert nearest_names("", ["", "A"]) == nearest_names("A", [""]) == ()
-
-
-def test_upper_and_lower_case_do_not_matter_in_a_selection() -> None:
-    choice = NameChoice(["mc_yaw*", "Mpc_xy_p", "ringbuffer"])
-    assert choice.choose(NAMES) == {"MC_YAWRATE_P", "MC_YAW_P", "MPC_XY_P", "ringBuffer"}
-    assert choice.has("mc_yaw_p")
-    assert choice.has("MPC_XY_P")
-    assert not choice.has("MC_ROLL_P")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from paramclient.model.paramset import (
+    Default,
     DefaultSource,
     ParamMap,
     ParamSet,
@@ -25,18 +26,18 @@ def param(
     return Param(name, value, kind, 0, bits_of(value, kind), default=default)
 
 
-def test_the_default_of_the_vehicle_has_priority() -> None:
-    default = default_of(param("P", 1.0, default=2.0), 3.0)
-    assert default is not None
-    assert (default.value, default.source) == (2.0, DefaultSource.VEHICLE)
-
-
-def test_without_one_the_default_of_the_metadata_counts() -> None:
-    default = default_of(param("P", 1.0), 3)
-    assert default is not None
-    assert (default.value, default.source) == (3.0, DefaultSource.METADATA)
-    assert isinstance(default.value, float)
-    assert default_of(param("P", 1.0)) is None
+@pytest.mark.parametrize(
+    ("own", "described", "default"),
+    [
+        (2.0, 3.0, Default(2.0, DefaultSource.VEHICLE)),
+        (None, 3, Default(3.0, DefaultSource.METADATA)),
+        (None, None, None),
+    ],
+)
+def test_the_default_of_the_vehicle_counts_before_that_of_the_metadata(
+    own: float | None, described: float | None, default: Default | None
+) -> None:
+    assert repr(default_of(param("P", 1.0, default=own), described)) == repr(default)
 
 
 def test_a_decimal_default_is_rounded_as_the_vehicle_rounds_it() -> None:

@@ -37,16 +37,6 @@ def test_results_of_sets() -> None:
     assert result(station, set_mode(1, name="NO_SUCH")) == []
 
 
-def test_a_slow_change() -> None:
-    camera = Camera(slow={"CAM_MODE": 2.0})
-    station = Station(camera)
-    assert result(station, set_mode(0)) == [(1, ExtAckResult.IN_PROGRESS)]
-    assert result(station, set_mode(5)) == [(1, ExtAckResult.IN_PROGRESS)]
-    assert station.wait(2.1).receive(messages.ParamExtAck)[0].param_result == ExtAckResult.ACCEPTED
-    assert camera.ext_values["CAM_MODE"] == 0
-    assert result(station, set_mode(0)) == [(0, ExtAckResult.ACCEPTED)]
-
-
 @pytest.mark.parametrize(
     "arguments",
     [

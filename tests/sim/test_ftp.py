@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
-
-from paramclient.errors import FileErrorCode, UsageError
-from paramclient.model.px4_hash import crc32_px4
+from paramclient.errors import FileErrorCode
 from paramclient.model.values import ParamType
 from paramclient.protocol import param_pck
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.param_pck import PackedParam
-from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import messages
 from tests.ground_station import Station
 
@@ -90,14 +87,6 @@ def test_param_pck_has_the_current_values() -> None:
     assert after["COMPASS_DEC"].default is None
 
 
-def test_checksums_of_files() -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    pilot.vehicle.files["logs/1.bin"] = b"abc"
-    checksum = pilot.call(Opcode.CALC_FILE_CRC32, b"logs/1.bin")
-    assert int.from_bytes(checksum.data, "little") == crc32_px4(b"abc")
-    assert refusal(pilot.call(Opcode.CALC_FILE_CRC32, b"nothing")) == (FileErrorCode.FILE_NOT_FOUND,)
-
-
 class TestSessions:
     def test_px4_closes_a_session_after_11_s(self) -> None:
         pilot = Pilot(PX4Vehicle())
@@ -157,13 +146,3 @@ class TestSwitches:
         assert new.call(Opcode.OPEN_FILE_RO, PARAMS).opcode == Opcode.ACK
         data = b"".join(each.data for each in new.burst(session=0) if each.opcode == Opcode.ACK)
         assert list(param_pck.decode(data).entries) == packed(new.vehicle)
-
-    @pytest.mark.parametrize(
-        "vehicle", [ArduPilotVehicle(ftp=False), GenericVehicle({"A": 1})], ids=["ardupilot", "generic"]
-    )
-    def test_without_mavftp_requests_are_not_answered(self, vehicle: Vehicle) -> None:
-        pilot = Pilot(vehicle)
-        pilot.request(Packet(1, 0, Opcode.OPEN_FILE_RO, PARAMS))
-        assert pilot.listen(1.0) == []
-        with pytest.raises(UsageError, match="this vehicle has no MAVFTP"):
-            assert vehicle.files
