@@ -218,16 +218,10 @@ CASES: Final = {
             "restore URL --vehicle 1/100 --extended --json",
         ),
     ),
-    "import": Case(
-        None, ("import DATA/px4_full_download.tlog --json", "import DATA/ardupilot_flight.bin --json")
-    ),
+    "import": Case(None, ("import DATA/px4_full_download.tlog DATA/ardupilot_flight.bin --json",)),
     "cache": Case(
         quad,
-        (
-            FETCH,
-            "cache list --json",
-            "cache remove 1 --json",
-        ),
+        (FETCH, "cache list --json", "cache remove 1 --json"),
     ),
     "metadata": Case(
         None,
@@ -266,15 +260,8 @@ def outputs(case: Case, command: Command, put: Put, folder: Path) -> list[Any]:
 def test_json_is_as_recorded(
     name: str, command: Command, put: Put, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    port = SerialPort(
-        device="/dev/ttyACM0",
-        by_id="/dev/serial/by-id/usb-Pixhawk",
-        vendor_id=0x26AC,
-        product_id=0x11,
-        manufacturer="3D Robotics",
-        product="PX4 FMU v5.x",
-        serial_number="0",
-    )
+    texts = ("3D Robotics", "PX4 FMU v5.x", "0")
+    port = SerialPort("/dev/ttyACM0", "/dev/serial/by-id/usb-Pixhawk", 0x26AC, 0x11, *texts)
     monkeypatch.setattr(link_command, "list_ports", lambda: [port])
     found = outputs(CASES[name], command, put, tmp_path)
     path = DATA / "json" / f"{name}.json"
