@@ -87,24 +87,16 @@ async def known_of_session(
         return choice
     if choice is None and not needed_for:
         return await _stored(session)
-    found = await request_from_vehicle(session)
+    what = f"the parameter metadata of {session.label}"
+    with Status(f"waiting for {what}", f"downloading {what}, bytes:") as status:
+        left = session.deadline.left()
+        found = await metadata_of(session.component, timeout=left, progress=status.count)
     if found is None and choice is None:
         found = await _stored(session, added_only=True)
     if found is None:
         problem = f"{needed_for}. " if needed_for else ""
         raise UsageError(f"{problem}{session.label} does not describe its parameters; {METADATA_HINT}")
     return found
-
-
-async def request_from_vehicle(session: CommandSession) -> Metadata | None:
-    """Return the metadata of the vehicle, or None if it has none.
-
-    Raises:
-        UsageError, VehicleError, NoReply, LinkError: as `metadata_of`.
-    """
-    what = f"the parameter metadata of {session.label}"
-    with Status(f"waiting for {what}", f"downloading {what}, bytes:") as status:
-        return await metadata_of(session.component, timeout=session.deadline.left(), progress=status.count)
 
 
 async def _stored(session: CommandSession, *, added_only: bool = False) -> Metadata | None:

@@ -13,16 +13,7 @@ import anyio
 
 from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import LinkOptions, TrafficOptions
-from paramclient.cli.output import (
-    ExitCode,
-    Status,
-    listed,
-    print_json,
-    print_table,
-    report,
-    report_all,
-    say,
-)
+from paramclient.cli.output import ExitCode, Status, listed, print_json, print_table, report, report_all, say
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, NoReply, ParamClientError, UnknownParameter, UsageError

@@ -106,11 +106,7 @@ class Inspection:
         return READ_OVERHEAD + count * pace < self.download_time
 
 
-async def inspect(
-    component: Component,
-    wanted: ParamSet,
-    absent: frozenset[str] = frozenset(),
-) -> Inspection:
+async def inspect(component: Component, wanted: ParamSet, absent: frozenset[str] = frozenset()) -> Inspection:
     """Update the table, and read by name the wanted parameters that it does not have.
 
     Vehicles have parameters that are in no list: those that PX4 does not use yet, and those of a group that

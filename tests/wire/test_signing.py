@@ -16,14 +16,7 @@ from pymavlink.dialects.v20 import all as dialect
 
 from paramclient.errors import UsageError
 from paramclient.wire.frames import Framer, checksum, sign_frame
-from paramclient.wire.messages import (
-    Message,
-    ParamRequestRead,
-    ParamValue,
-    SetupSigning,
-    decode,
-    encode,
-)
+from paramclient.wire.messages import Message, ParamRequestRead, ParamValue, SetupSigning, decode, encode
 from paramclient.wire.signing import (
     ADOPTED_TIMESTAMP_MAX,
     TIMESTAMP_LAG_MAX,
