@@ -132,19 +132,16 @@ class CacheWriter:
                 if anyio.current_time() >= deadline:
                     break
                 await anyio.sleep(CLOSE_RETRY_INTERVAL)
-        if not is_written and not was_warned:
-            self._warn_of_lost()
-        if self._owned:
-            with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
-                await self.run_in_thread(self.cache.close)
-
-    def _warn_of_lost(self) -> None:
-        for node, identity in self._identities.items():
+        lost = () if is_written or was_warned else self._identities.items()
+        for node, identity in lost:
             if any(self._record(node, session).is_unwritten for session in node.sessions):
                 logger.warning(
                     "the last values of %d/%d (%s) are not in the cache, and lost: %s",
                     *(node.system, node.component, identity.key, self.failure or "timeout"),
                 )
+        if self._owned:
+            with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
+                await self.run_in_thread(self.cache.close)
 
     def may_have(self, node: Node) -> bool:
         """Return whether the cache had a table for these ids when the client was opened."""

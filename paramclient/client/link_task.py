@@ -126,7 +126,8 @@ class LinkTask:
             self.notify()
             if not self.station.is_waiting:
                 spent = anyio.current_time() - before
-                await self._rest(min(READ_PAUSE, PAUSE_DATAGRAMS_MAX * spent / len(chunks)))
+                with anyio.move_on_after(min(READ_PAUSE, PAUSE_DATAGRAMS_MAX * spent / len(chunks))):
+                    await self._something_to_send.wait()  # a sent frame may cause a response
 
     async def send(self) -> None:
         """Send queued frames, those of another program after those of this one, until cancelled."""
@@ -163,11 +164,6 @@ class LinkTask:
             frames = self.cutter.cut(data, peer)
             for tap in self._taps:
                 tap.received(frames, len(data), peer)
-
-    async def _rest(self, seconds: float) -> None:
-        """Pause reading for this time, or until a frame is sent, which may cause a response."""
-        with anyio.move_on_after(seconds):
-            await self._something_to_send.wait()
 
     async def _reconnect(self, error: LinkError) -> None:
         """Reopen the link, without a time limit."""

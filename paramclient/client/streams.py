@@ -72,7 +72,10 @@ class Changes(Stream[Change]):
         """Add a change, or merge it with the queued change of the same parameter."""
         earlier = self._waiting.pop(item.name, None)
         if earlier is not None:
-            item = _merged(earlier, item)
+            kind = item.kind
+            if item.new is not None:
+                kind = earlier.kind if earlier.old is None else "changed"
+            item = replace(item, old=earlier.old, kind=kind)
             if item.old is None and item.new is None:
                 return
             if item.old is not None and item.new is not None and item.old.same_value(item.new):
@@ -103,10 +106,3 @@ class Subscribers(Generic[Item]):
         self._end = (error,)
         for stream in list(self._streams):
             stream.end(error)
-
-
-def _merged(earlier: Change, later: Change) -> Change:
-    kind = later.kind
-    if later.new is not None:
-        kind = earlier.kind if earlier.old is None else "changed"
-    return replace(later, old=earlier.old, kind=kind)

@@ -32,21 +32,17 @@ Content: TypeAlias = ParamFile | ParamSet | Iterable[ParamSet]
 
 @dataclass(frozen=True, slots=True)
 class _Format:
-    """How a format is recognized, read and written.
+    """How a format is read and written.
 
     Attributes:
-        is_seen_in: whether the content has this format and no other; the lists of pairs are left.
         read: returns the content, or raises FileError.
         write: returns the lines or bytes of sets, or raises UsageError.
         express: returns what is written of one parameter, or raises UsageError.
-        holds_several: whether the format holds several components.
     """
 
-    is_seen_in: Callable[[Reading], bool]
     read: Callable[[Reading, FileFormat], ParamFile]
     write: Callable[[Sequence[ParamSet], ParamFile], Iterator[str] | bytes]
     express: Callable[[ParamSet, WrittenParam], object]
-    holds_several: bool = False
 
 
 # param.pck: types, exact values and defaults, without vehicle and component
@@ -105,34 +101,18 @@ def _pack_entry(_: ParamSet, param: WrittenParam) -> param_pck.PackedParam:
 
 def _pairs(separator: str) -> _Format:
     line = functools.partial(lists.pair_line, separator)
-    return _Format(lambda _: False, lists.read_pairs, functools.partial(lists.write_list, line), line)
+    return _Format(lists.read_pairs, functools.partial(lists.write_list, line), line)
 
 
 _FORMATS: Final = {
-    FileFormat.PCK: _Format(
-        lambda reading: reading.data.startswith(param_pck.MAGICS),
-        _read_packed,
-        lambda sets, _: _write_packed(sets[0]),
-        _pack_entry,
-    ),
-    FileFormat.JSON: _Format(
-        lambda reading: reading.first.startswith("{"),
-        json_format.read_json,
-        json_format.write_json,
-        json_format.json_fields,
-        holds_several=True,
-    ),
-    FileFormat.QGC: _Format(
-        lambda reading: lists.is_qgc_row(reading.first),
-        lists.read_qgc,
-        lists.write_qgc,
-        lists.qgc_line,
-        holds_several=True,
-    ),
+    FileFormat.PCK: _Format(_read_packed, lambda sets, _: _write_packed(sets[0]), _pack_entry),
+    FileFormat.JSON: _Format(json_format.read_json, json_format.write_json, json_format.json_fields),
+    FileFormat.QGC: _Format(lists.read_qgc, lists.write_qgc, lists.qgc_line),
     FileFormat.PARM: _pairs(" "),
     FileFormat.MISSION_PLANNER: _pairs(","),
 }
-"""The formats, in the order in which they are looked for."""
+_SEVERAL: Final = (FileFormat.JSON, FileFormat.QGC)
+"""The formats that hold several components."""
 
 
 def loads(
@@ -197,9 +177,12 @@ def _read(reading: Reading, file_format: FileFormat | str | None) -> ParamFile:
 
 
 def _format_of(reading: Reading) -> FileFormat:
-    for each, known in _FORMATS.items():
-        if known.is_seen_in(reading):
-            return each
+    if reading.data.startswith(param_pck.MAGICS):
+        return FileFormat.PCK
+    if reading.first.startswith("{"):
+        return FileFormat.JSON
+    if lists.is_qgc_row(reading.first):
+        return FileFormat.QGC
     named = ENDINGS.get(PurePath(reading.source).suffix.lower(), FileFormat.PCK)
     if named in (FileFormat.PARM, FileFormat.MISSION_PLANNER):
         return named
@@ -308,7 +291,7 @@ def _check(sets: Sequence[ParamSet], file_format: FileFormat) -> None:
     """Raise UsageError for sets that are not valid, or that a format cannot hold together."""
     if not sets:
         raise UsageError("there are no parameters to write")
-    if len(sets) > 1 and not _FORMATS[file_format].holds_several:
+    if len(sets) > 1 and file_format not in _SEVERAL:
         components = ", ".join(map(address, sets))
         raise UsageError(
             f"the format {file_format} holds one component, and there are {components}; choose one"

@@ -74,10 +74,9 @@ def _named_errors(source: str, done: str) -> Iterator[None]:
         yield
     except FileError:
         raise  # is a ValueError too, and has its path already
-    except OSError as error:
-        raise FileError(f"cannot be {done}: {error.strerror}", source=source) from error
-    except ValueError as error:  # a NUL in the path
-        raise FileError(f"cannot be {done}: {error}", source=source) from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        why = error.strerror if isinstance(error, OSError) else error
+        raise FileError(f"cannot be {done}: {why}", source=source) from error
 
 
 def _sync_folder(folder: Path) -> None:

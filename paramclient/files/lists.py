@@ -50,7 +50,8 @@ _include: Final = re.compile(r"@include[ \t]+(.*\S)").fullmatch
 _blanks: Final = re.compile(r"[ \t]+")
 _between: Final = re.compile(r"[ \t]*[,=][ \t]*|[ \t]+")
 _decimal_comma: Final = re.compile(r"(?:^|[ \t,=])[+-]?[0-9]+,[0-9]+$").search
-_qgc_row: Final = re.compile(r"[0-9]+[ \t]+[0-9]+[ \t]+[^ \t]+[ \t]+[^ \t]+[ \t]+[0-9]+").fullmatch
+is_qgc_row: Final = re.compile(r"[0-9]+[ \t]+[0-9]+[ \t]+[^ \t]+[ \t]+[^ \t]+[ \t]+[0-9]+").fullmatch
+"""Whether a line could be one of QGroundControl's."""
 
 Comments: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
 """The header and the footer of a file."""
@@ -183,11 +184,6 @@ class _Pairs:
 
 
 # QGroundControl's
-
-
-def is_qgc_row(text: str) -> bool:
-    """Return whether a line could be one of QGroundControl's."""
-    return _qgc_row(text) is not None
 
 
 def read_qgc(reading: Reading, file_format: FileFormat) -> ParamFile:

@@ -139,9 +139,7 @@ def _parse(name: str) -> LinkSpec:
             raise UsageError(what)
         return _network(LinkKind.UDPIN, name)
     rest = scheme[2].removeprefix("//")
-    if kind in _PARSERS:
-        return _PARSERS[kind](rest)
-    return _network(kind, rest)
+    return _PARSERS[kind](rest) if kind in _PARSERS else _network(kind, rest)
 
 
 def _network(kind: LinkKind, rest: str) -> LinkSpec:

@@ -88,6 +88,7 @@ class SocketLink(BaseLink):
         super().__init__(spec.name)
         self._host = spec.host
         self._port = spec.port
+        self._target = spec.name.partition(":")[2]
         self._open_socket: socket.socket | None = None
 
     @property
@@ -103,13 +104,19 @@ class SocketLink(BaseLink):
             raise self._error("not open")
         return self._open_socket
 
-    def _adopt(self, sock: socket.socket, opening: int) -> None:
-        """Replace the current socket, unless the link was closed while the new socket was opened."""
-        if opening != self._openings:
-            sock.close()
+    def _create(self, family: socket.AddressFamily, kind: socket.SocketKind, opening: int) -> socket.socket:
+        """Replace the current socket by a new one, unless the link has been closed meanwhile.
+
+        Its port is exclusive. On systems other than Windows, two sockets share a port only if both request
+        it.
+        """
         self._check(opening)
         close_socket(self._open_socket)
-        self._open_socket = sock
+        sock = self._open_socket = socket.socket(family, kind)
+        sock.setblocking(False)
+        if sys.platform == "win32":
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
+        return sock
 
     async def _release(self) -> None:
         close_socket(self._open_socket)
@@ -145,10 +152,6 @@ class SocketLink(BaseLink):
             return f"no permission to use port {port}: ports below {PRIVILEGED_PORTS} need privileges"
         return super()._refusal(error)
 
-    @property
-    def _target(self) -> str:
-        return f"[{self._host}]:{self._port}" if ":" in self._host else f"{self._host}:{self._port}"
-
     async def _resolve(self, kind: socket.SocketKind) -> list[tuple[socket.AddressFamily, Address]]:
         """Return the addresses of the host, IPv4 first, because most MAVLink programs listen on IPv4."""
         try:
@@ -157,15 +160,6 @@ class SocketLink(BaseLink):
             found = await anyio.getaddrinfo(self._host, self._port, type=kind)
         pairs = [(family, address) for family, _, _, _, address in found]
         return sorted(pairs, key=lambda pair: pair[0] != socket.AF_INET)
-
-
-def claim(sock: socket.socket) -> None:
-    """Make a socket's port exclusive, before binding.
-
-    On systems other than Windows, two sockets share a port only if both request it.
-    """
-    if sys.platform == "win32":
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
 
 
 def close_socket(sock: socket.socket | None) -> None:
@@ -241,10 +235,7 @@ class UdpIn(SocketLink):
         self._local_port = sock.getsockname()[1]
 
     def _new_socket(self, family: socket.AddressFamily, opening: int) -> socket.socket:
-        sock = socket.socket(family, socket.SOCK_DGRAM)
-        self._adopt(sock, opening)
-        sock.setblocking(False)
-        claim(sock)
+        sock = self._create(family, socket.SOCK_DGRAM, opening)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         for option in (socket.SO_RCVBUF, _SO_RCVBUFFORCE) if sys.platform == "linux" else (socket.SO_RCVBUF,):
             with suppress(OSError):  # beyond the limit, or not privileged
@@ -348,8 +339,7 @@ class TcpOut(SocketLink, StreamLink):
     async def _open(self, opening: int) -> None:
         status = 0
         for family, address in await self._resolve(socket.SOCK_STREAM):
-            sock = socket.socket(family, socket.SOCK_STREAM)
-            self._adopt(sock, opening)
+            sock = self._create(family, socket.SOCK_STREAM, opening)
             _set_up(sock)
             status = sock.connect_ex(address)
             if status in (errno.EINPROGRESS, errno.EWOULDBLOCK):
@@ -409,10 +399,7 @@ class TcpIn(SocketLink):
 
     async def _open(self, opening: int) -> None:
         family, address = (await self._resolve(socket.SOCK_STREAM))[0]
-        listener = socket.socket(family, socket.SOCK_STREAM)
-        self._adopt(listener, opening)
-        listener.setblocking(False)
-        claim(listener)
+        listener = self._create(family, socket.SOCK_STREAM, opening)
         if sys.platform != "win32":  # on Windows the option would let others share the port
             # The option allows binding again while old connections are in TIME_WAIT.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
