@@ -175,17 +175,12 @@ class ReplayLink(BaseLink):
         self._file: BinaryIO | None = None
         self._records: Iterator[Record] = iter(())
         self._next: Record | None = None
-        self._due = 0.0
-        self._is_over = False
+        self._due = -math.inf
         self._closed = anyio.Event()
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`."""
-        await anyio.lowlevel.checkpoint()
-        if self._next is not None and self._due > anyio.current_time():
-            with anyio.CancelScope(deadline=self._due):
-                await self._closed.wait()
-        elif self._is_over:
+        with anyio.CancelScope(deadline=self._due):
             await self._closed.wait()
         self._opened()
         found: list[tuple[Peer, bytes]] = []
@@ -193,7 +188,8 @@ class ReplayLink(BaseLink):
             found.append((LOG_PEER, self._next.data))
             self.at = self._next.at
             self._advance(self._next)
-        self._is_over = not found
+        if not found:  # the log is over
+            self._due = math.inf
         return found
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
@@ -206,7 +202,6 @@ class ReplayLink(BaseLink):
         self._records = read_records(self._file)
         self._closed = anyio.Event()
         self._due = anyio.current_time()
-        self._is_over = False
         self._next = next(self._records, None)
 
     async def _release(self) -> None:
