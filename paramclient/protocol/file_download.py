@@ -37,8 +37,7 @@ async def download_file(session: Session) -> int:
         raise FileUnavailable("the round trip is too long to find out whether MAVFTP is served")
     if not await is_free(session.channel):
         raise FileUnavailable(BUSY)
-    query, reason = WITH_DEFAULTS, ""
-    attempts = 0
+    query, reason, attempts = WITH_DEFAULTS, "", 0
     while attempts < DOWNLOADS_MAX:
         requested_at = anyio.current_time()
         try:
@@ -49,8 +48,8 @@ async def download_file(session: Session) -> int:
             if is_missing and query and not _adds_defaults(session.identification):
                 query = ""
                 continue
-            if is_missing or error.code == FileErrorCode.UNKNOWN_COMMAND:
-                session.serves_file = False
+            if (is_missing and not session.serves_file) or error.code == FileErrorCode.UNKNOWN_COMMAND:
+                session.serves_file = False  # else another station has closed it
             raise FileUnavailable(f"the parameter file was refused: {error.reason}") from None
         except NoReply as error:
             is_silent = not isinstance(error, FileCutOff)
@@ -110,6 +109,7 @@ async def _read(session: Session, path: str, requested_at: float) -> tuple[bytes
     def begun(head: bytes) -> None:
         nonlocal total
         total = _store_beginning(session, head, requested_at) or total  # others have first values then
+        session.serves_file = True
         if known not in (None, total):
             tasks.start_soon(read_count)
 

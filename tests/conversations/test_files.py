@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from functools import partial
 from random import Random
@@ -17,6 +18,7 @@ from paramclient.protocol.ftp import FileCutOff, Opcode, Packet, checksum, path_
 from paramclient.protocol.param_pck import PackedParam, encode
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire.messages import FileTransfer, Message, ParamValue
+from paramclient.wire.messages import encode as frame
 from tests.conversations.virtual import Silence, Tap, losing, talking, virtual_on_both
 
 BOTH = pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
@@ -255,6 +257,20 @@ async def test_a_refused_file_is_not_requested_again_on_the_link() -> None:
             assert (result.source, bool(result.missing)) == ("stream", False)
         requests = [each.opcode for each in packets_in(conversation.sent_of(FileTransfer))]
         assert requests.count(Opcode.OPEN_FILE_RO) <= 1
+
+
+async def test_a_file_that_another_station_has_closed_is_requested_again_the_next_time() -> None:
+    vehicle, blocks = ArduPilotVehicle(), itertools.count()
+
+    def closes(message: Message) -> bool:
+        if not isinstance(message, FileTransfer) or next(blocks) != 20:
+            return True
+        reset = FileTransfer(0, 1, 1, Packet(1, 0, Opcode.RESET_SESSIONS).pack())
+        vehicle.receive(frame(reset, system=250, component=190, sequence=0), anyio.current_time())
+        return False
+
+    async with talking(Tap(vehicle, down=closes)) as (_, session):
+        assert [(await fetch_all(session, refresh=True)).source for _ in range(2)] == ["stream", "ftp"]
 
 
 async def test_a_lost_opening_of_the_file_is_repeated_before_the_list_is_taken() -> None:
