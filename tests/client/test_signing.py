@@ -56,6 +56,12 @@ def test_a_file_holds_a_key_as_it_is_or_as_text(tmp_path: Path, data: bytes) -> 
             UsageError, match=rf"key: other users than its owner .* \(mode {mode:o}\); run `chmod 600`"
         ):
             read_key(path)
+    path.write_bytes(b"hunter2-hunter2")
+    path.chmod(0o600)
+    with pytest.raises(UsageError) as caught:
+        read_key(path)
+    assert str(caught.value).startswith(f"{path}: a signing key ")
+    assert "hunter2" not in "".join(traceback.format_exception(caught.value))
 
 
 def test_the_environment_names_a_key_in_one_of_three_ways(tmp_path: Path) -> None:
