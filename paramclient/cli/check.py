@@ -13,15 +13,7 @@ from cyclopts import Parameter
 
 from paramclient.cli.json_output import JsonObject, taken, vehicle_json
 from paramclient.cli.options import Seconds, TrafficOptions
-from paramclient.cli.output import (
-    Coloured,
-    ExitCode,
-    Status,
-    milliseconds,
-    print_json,
-    print_line,
-    print_table,
-)
+from paramclient.cli.output import ExitCode, Status, milliseconds, print_json, print_line, print_table
 from paramclient.cli.session import ChosenVehicle, Deadline, listen, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
@@ -70,8 +62,6 @@ NO_ACKNOWLEDGEMENT: Final = (
 )
 """The finding about a vehicle that acknowledges no command, and what to do about it."""
 _DEFAULTS: Final = TrafficOptions()
-_STYLES: Final = {"problem": "red", "slow": "yellow"}
-"""Styles of each severity."""
 
 Result = TypeVar("Result")
 
@@ -111,8 +101,7 @@ async def check(
     print_table(("what", "measured"), found.rows)
     print_line("" if found.findings else "\nNothing slow or unusual.")
     if found.findings:
-        rows = [(Coloured(severity, _STYLES[severity]), text) for severity, text in found.findings]
-        print_table(("severity", "slow or unusual"), rows)
+        print_table(("severity", "slow or unusual"), found.findings)
     return found.code
 
 

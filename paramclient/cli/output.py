@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
-from typing import ClassVar, Final, Self, TextIO
+from typing import Any, ClassVar, Final, Self, TextIO
 
 import anyio
 import anyio.to_thread
@@ -50,6 +50,12 @@ _RIGHT_ALIGNED: Final = frozenset(
     }
 )
 """Headings of columns with numbers."""
+_WHOLE: Final[dict[str, Any]] = {
+    "break_long_words": False,
+    "break_on_hyphens": False,
+    "replace_whitespace": False,
+}
+"""Options of `textwrap` with which words and blanks stay as they are."""
 _STYLES: Final = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33"}
 """Codes of the styles of a terminal."""
 
@@ -129,36 +135,42 @@ def _wrapped(text: str, stream: TextIO) -> str:
 def _fold(text: str, width: int) -> list[str]:
     """Return text as lines of at most this width; words, such as names and values, stay whole."""
     indent = text[: len(text) - len(text.lstrip())] + GAP
-    wrapper = textwrap.TextWrapper(
-        max(width, 1),
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-        replace_whitespace=False,
-    )
-    return wrapper.wrap(text) or [text]
+    return textwrap.wrap(text, max(width, 1), subsequent_indent=indent, **_WHOLE) or [text]
 
 
 # Tables
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a table. On a terminal, sentences in the last column are wrapped at spaces.
+    """Print a table; on a terminal with styles, and with sentences in the last column wrapped at spaces.
 
     Args:
         columns: the headings.
         rows: the cells of each row; None is an empty cell. A column without any cell is left out.
     """
-    print("\n".join(_table_lines(columns, [*rows], is_terminal=sys.stdout.isatty())), flush=True)
+    cells, is_terminal = [*rows], sys.stdout.isatty()
+    kept = [at for at in range(len(columns)) if not cells or any(row[at] is not None for row in cells)]
+    names = [columns[at] for at in kept]
+    table: list[list[object]] = [[Coloured(each, "bold") for each in names]]
+    table += [[row[at] for at in kept] for row in cells]
+    texts = [["" if cell is None else printable(str(cell)) for cell in row] for row in table]
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    begin = sum(len(GAP) + each for each in widths[:-1])  # of the last column
+    left = max(shutil.get_terminal_size().columns - begin, SENTENCE_WIDTH_MIN)
+    for row, words in zip(table, texts, strict=True):
+        line = ""
+        if is_terminal:
+            words[-1] = f"\n{' ' * begin}".join(_fold(words[-1], left))
+        for cell, text, width, name in zip(row, words, widths, names, strict=True):
+            padding = " " * (width - len(text))
+            shown = _styled(text, getattr(cell, "style", "")) if is_terminal else text
+            line += (padding + shown if name in _RIGHT_ALIGNED else shown + padding) + GAP
+        print(line.rstrip())
+    sys.stdout.flush()
 
 
 def show(
-    item: object,
-    columns: Sequence[str],
-    rows: Iterable[Sequence[object]],
-    *,
-    json: bool,
-    empty: str = "",
+    item: object, columns: Sequence[str], rows: Iterable[Sequence[object]], *, json: bool, empty: str = ""
 ) -> None:
     """Print an object as JSON, or its rows as a table; if `empty` is given and there are none, say that."""
     if json:
@@ -186,29 +198,6 @@ def cells_of(objects: Mapping[str, Mapping[str, object]], *members: str) -> Iter
 def clear_screen() -> None:
     """Erase a terminal, for a table that is printed again and again in the same place."""
     sys.stdout.write("\x1b[H\x1b[J")
-
-
-def _table_lines(
-    columns: Sequence[str], rows: Sequence[Sequence[object]], *, is_terminal: bool
-) -> Iterable[str]:
-    """Yield the lines of a table; for a terminal with styles, and with sentences that are wrapped."""
-    kept = [at for at in range(len(columns)) if not rows or any(row[at] is not None for row in rows)]
-    names = [columns[at] for at in kept]
-    table: list[list[object]] = [[Coloured(each, "bold") for each in names]]
-    table += [[row[at] for at in kept] for row in rows]
-    texts = [["" if cell is None else printable(str(cell)) for cell in row] for row in table]
-    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
-    begin = sum(len(GAP) + each for each in widths[:-1])  # of the last column
-    left = max(shutil.get_terminal_size().columns - begin, SENTENCE_WIDTH_MIN)
-    for row, cells in zip(table, texts, strict=True):
-        line = ""
-        if is_terminal:
-            cells[-1] = f"\n{' ' * begin}".join(_fold(cells[-1], left))
-        for cell, text, width, name in zip(row, cells, widths, names, strict=True):
-            padding = " " * (width - len(text))
-            shown = _styled(text, getattr(cell, "style", "")) if is_terminal else text
-            line += (padding + shown if name in _RIGHT_ALIGNED else shown + padding) + GAP
-        yield line.rstrip()
 
 
 def _styled(text: str, style: str) -> str:
