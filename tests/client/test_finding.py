@@ -31,10 +31,10 @@ from tests.shell import (
 
 async def test_the_first_autopilot_is_the_component() -> None:
     camera = generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
-    async with connected(Air([camera, generic(system=7, component=1), generic(system=9)])) as (
-        client,
-        component,
-    ):
+    air = Air([camera, generic(system=7, component=1), generic(system=9)])
+    async with connected(air) as (client, component):
+        await client.fetch_all()
+        assert client.autopilots == [client.components[7, 1], client.components[9, 1]]
         assert (component.system, component.component) == (7, 1)
         assert await client.component() is component
         assert await client.component(system=9) is client.components[9, 1]
@@ -72,17 +72,6 @@ async def test_an_id_that_no_component_has_is_an_error_at_once(wanted: dict[str,
         for find in (client.component, client.only_component):
             with pytest.raises(UsageError, match="component ids 0 to 255, not"):
                 await find(**wanted, timeout=None)
-
-
-async def test_the_autopilots_are_the_vehicles_without_what_they_carry() -> None:
-    camera = generic(system=1, component=100)
-    vehicles = [generic(system=3), small_px4(), camera, generic(system=2, component=7)]
-    async with a_client(Air(vehicles)) as client:
-        assert client.autopilots == []
-        await client.fetch_all()
-        addresses = [(each.system, each.component) for each in client.autopilots]
-        assert addresses == [(1, 1), (2, 7), (3, 1)]
-        assert len(client.components) == 4
 
 
 # the only vehicle

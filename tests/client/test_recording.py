@@ -241,23 +241,6 @@ async def test_a_stream_that_drops_is_not_continued(tmp_path: Path) -> None:
 WATCHED = "paramclient"
 
 
-def test_nothing_is_printed_unless_requested() -> None:
-    program = """
-import asyncio, logging, paramclient
-paramclient.ParamClient  # loads its module
-names = [name for name in logging.root.manager.loggerDict if name.startswith("paramclient")]
-assert names and not any(logging.getLogger(name).handlers for name in names)
-async def main():
-    async with paramclient.ParamClient("sim:px4", cache=False) as client:
-        await (await client.component()).get("MC_ROLL_P")
-asyncio.run(main())
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
-    )
-    assert (done.stdout, done.stderr) == ("", "")
-
-
 def test_the_command_logs_its_steps(capsys: pytest.CaptureFixture[str]) -> None:
     level = logging.getLogger("paramclient").level
     for option, code, name in (("-v", 0, "MC_ROLL_P"), ("--verbose", 2, "BAD\x1b[31m")):
