@@ -20,9 +20,9 @@ from paramclient.cli.cached import parse_time
 from paramclient.cli.json_output import JsonObject, apply_json, plan_json, row_json, rows_json
 from paramclient.cli.metadata import MetadataChoice, default_in, known_of_session, no_defaults, say_sources
 from paramclient.cli.options import ApplyFlags
-from paramclient.cli.output import Coloured, ExitCode, Status, can_ask, code_of, confirm, listed, report, say
+from paramclient.cli.output import ExitCode, Status, can_ask, code_of, confirm, listed, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, check_given, get_chosen, sessions
-from paramclient.cli.set_command import STYLES, write_all
+from paramclient.cli.set_command import write_all
 from paramclient.cli.sources import check_pattern, described, fill_pattern, is_pattern_name, resolve_all
 from paramclient.files import FileFormat, ParamFile
 from paramclient.model.names import age_in_words, counted, is_pattern
@@ -454,4 +454,4 @@ class _Job:
 def _cells(row: ApplyRow, reason: str) -> Sequence[object]:
     found = row_json(row)
     values = map(found.get, ("before", "wanted", "actual"))
-    return row.name, *values, Coloured(row.status, STYLES[row.status]), reason
+    return row.name, *values, row.status, reason

@@ -13,7 +13,6 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
 from typing import Any, ClassVar, Final, Self, TextIO
@@ -56,19 +55,15 @@ _WHOLE: Final[dict[str, Any]] = {
     "replace_whitespace": False,
 }
 """Options of `textwrap` with which words and blanks stay as they are."""
-_STYLES: Final = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33"}
-"""Codes of the styles of a terminal."""
-
-
-@dataclass(frozen=True, slots=True)
-class Coloured:
-    """A cell of a table with a style, such as `bold red`, which only terminals show."""
-
-    text: str
-    style: str
-
-    def __str__(self) -> str:
-        return self.text
+_STYLED: Final = frozenset({"status", "is", "changed", "severity"})
+"""Headings of columns with outcomes, differences and findings."""
+_STYLES: Final = {
+    **dict.fromkeys(("set", "accepted", "only right"), "32"),
+    **dict.fromkeys(("later", "adjusted", "unproven", "different", "slow"), "33"),
+    **dict.fromkeys(("refused", "invalid", "unknown", "only left", "conflict", "problem"), "31"),
+    **dict.fromkeys(("skipped", "not tried"), "2"),
+}
+"""Codes of the styles of these on a terminal: green, yellow, red and dim."""
 
 
 def printable(text: str) -> str:
@@ -151,19 +146,20 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Non
     cells, is_terminal = [*rows], sys.stdout.isatty()
     kept = [at for at in range(len(columns)) if not cells or any(row[at] is not None for row in cells)]
     names = [columns[at] for at in kept]
-    table: list[list[object]] = [[Coloured(each, "bold") for each in names]]
-    table += [[row[at] for at in kept] for row in cells]
+    table: list[list[object]] = [[*names], *([row[at] for at in kept] for row in cells)]
     texts = [["" if cell is None else printable(str(cell)) for cell in row] for row in table]
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     begin = sum(len(GAP) + each for each in widths[:-1])  # of the last column
     left = max(shutil.get_terminal_size().columns - begin, SENTENCE_WIDTH_MIN)
-    for row, words in zip(table, texts, strict=True):
+    for words in texts:
         line = ""
         if is_terminal:
             words[-1] = f"\n{' ' * begin}".join(_fold(words[-1], left))
-        for cell, text, width, name in zip(row, words, widths, names, strict=True):
-            padding = " " * (width - len(text))
-            shown = _styled(text, getattr(cell, "style", "")) if is_terminal else text
+        for text, width, name in zip(words, widths, names, strict=True):
+            padding, shown = " " * (width - len(text)), text
+            if is_terminal:
+                style = _STYLES.get(text.partition(", ")[0]) if name in _STYLED else None
+                shown = _styled(text, "1" if words is texts[0] else style)
             line += (padding + shown if name in _RIGHT_ALIGNED else shown + padding) + GAP
         print(line.rstrip())
     sys.stdout.flush()
@@ -200,10 +196,8 @@ def clear_screen() -> None:
     sys.stdout.write("\x1b[H\x1b[J")
 
 
-def _styled(text: str, style: str) -> str:
-    if not (style and text) or "NO_COLOR" in os.environ:
-        return text
-    return f"\x1b[{';'.join(_STYLES[each] for each in style.split())}m{text}\x1b[0m"
+def _styled(text: str, style: str | None) -> str:
+    return text if style is None or "NO_COLOR" in os.environ else f"\x1b[{style}m{text}\x1b[0m"
 
 
 # Questions

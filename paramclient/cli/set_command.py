@@ -16,7 +16,7 @@ from cyclopts.validators import Number
 from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
 from paramclient.cli.metadata import MetadataChoice, info_of, known_of_session
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import Coloured, Status, code_of, report, require_consent, say
+from paramclient.cli.output import Status, code_of, report, require_consent, say
 from paramclient.cli.session import CommandSession, Sessions, Shown, sessions, spelling
 from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import UnknownParameter, UsageError
@@ -25,14 +25,6 @@ from paramclient.metadata.info import ParamInfo, number_of
 from paramclient.model.values import ParamType, Value, check_name, format_value, parse_ext_value
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 
-STYLES: Final = {
-    **dict.fromkeys(("set", "accepted"), "green"),
-    **dict.fromkeys(("later", "adjusted", "unproven"), "yellow"),
-    **dict.fromkeys(("invalid", "unknown"), "bold red"),
-    **dict.fromkeys(("skipped", "not tried"), "dim"),
-    "refused": "red",
-}
-"""Styles of the outcomes of a value, and of the planned actions."""
 _DEFAULTS: Final = LinkOptions()
 
 
@@ -243,8 +235,7 @@ class SetJob:
             late = "takes effect after a reboot" if is_late else None
             reason = None if each["status"] == SetStatus.NOT_TRIED else each.get("reason")
             reasons = filter(None, (reason, each.get("note"), late))
-            status = Coloured(each["status"], STYLES[each["status"]])
-            yield each["name"], each["requested"], actual, status, "; ".join(reasons) or None
+            yield each["name"], each["requested"], actual, each["status"], "; ".join(reasons) or None
 
     def report(self) -> int:
         """Print the number of values with each outcome, and once why values were not tried."""

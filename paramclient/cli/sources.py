@@ -14,23 +14,14 @@ from cyclopts import Parameter
 from paramclient.cli.json_output import JsonObject, diff_json, taken
 from paramclient.cli.metadata import MetadataFile, defaults_in, known_of_sets, no_defaults, say_sources
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import (
-    Coloured,
-    ExitCode,
-    listed,
-    local_time,
-    print_json,
-    print_table,
-    report,
-    say,
-)
+from paramclient.cli.output import ExitCode, listed, local_time, print_json, print_table, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
 from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, writable, write_file
 from paramclient.files.formats import ENDINGS, address, format_of_name
 from paramclient.links import LinkKind, parse_link
 from paramclient.metadata import Metadata
-from paramclient.model.comparison import ChangedSide, compare
+from paramclient.model.comparison import compare
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.paramset import ParamSet, default_of
@@ -47,8 +38,6 @@ DEFAULTS: Final = "defaults"
 MEANING_LENGTH_MAX: Final = 40
 """Characters of the meaning of a value in a table. A bit mask of ArduPilot may have 30 names, and one such
 row would make the table wider than every screen."""
-_STYLES: Final = {"different": "yellow", "only left": "red", "only right": "green"}
-"""Styles of differences."""
 _DEFAULTS: Final = LinkOptions()
 
 
@@ -298,10 +287,9 @@ def _print(found: JsonObject) -> None:
             words.append(f"{entry['left']['type']} and {entry['right']['type']}")
         if entry["rounding"]:
             words.append("the same as float32")
-        style = "bold red" if side == ChangedSide.CONFLICT else _STYLES.get(entry["is"], "")
         values = [_shown(entry[each]) for each in ("left", "right", "base")]
         changed = None if found["base"] is None else side or "unknown"
-        rows.append([name, *values, entry.get("units"), Coloured(", ".join(words), style), changed])
+        rows.append([name, *values, entry.get("units"), ", ".join(words), changed])
     if rows:
         print_table(["name", "left", "right", "base", "units", "is", "changed"], rows)
 
