@@ -126,16 +126,6 @@ class Reading:
                 self.notes.append(_repetition(*params[param.name], param, place))
         params[param.name] = param, place
 
-    def check(self) -> None:
-        """Raise one FileError for all faults, if there are any."""
-        if not self._faults:
-            return
-        more = [": ".join(filter(None, (_place(of, at), what))) for of, at, what in self._faults[1:]]
-        if self.fault_count > len(self._faults):
-            more.append(f"and {self.fault_count - len(self._faults)} more")
-        source, line, what = self._faults[0]
-        raise FileError(what, source=source, line=line, more=tuple(more))
-
     def file(
         self,
         file_format: FileFormat,
@@ -146,9 +136,14 @@ class Reading:
         """Return the content: the added parameters, or `sets`.
 
         Raises:
-            FileError: the file has faults, or no parameters.
+            FileError: the file has faults, all of which the error has, or no parameters.
         """
-        self.check()
+        if self._faults:
+            (source, line, what), *others = self._faults
+            rest = [": ".join(filter(None, (_place(of, at), each))) for of, at, each in others]
+            if self.fault_count > len(self._faults):
+                rest.append(f"and {self.fault_count - len(self._faults)} more")
+            raise FileError(what, source=source, line=line, more=tuple(rest))
         if sets is None:
             sets = tuple(
                 ParamSet({name: p for name, (p, _) in each.items()}, component, system, source=self.source)
