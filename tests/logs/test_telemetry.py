@@ -208,6 +208,3 @@ def test_a_change_that_was_also_received_live_has_one_line(tmp_path: Path) -> No
     log = whole(A=1).wait(9.0).change("A", 3).wait(1.0).beat()
     imported(log.write(tmp_path / "flight.tlog"), cache=cache)
     assert lines(cache) == [("A", 1, 3, BY_US, pytest.approx(10.25))]
-
-
-# The command line

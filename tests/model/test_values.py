@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import decimal
 import math
 import struct
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
@@ -20,7 +19,6 @@ from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
-    Settable,
     Trust,
     Value,
     check_ext_value,
@@ -224,31 +222,39 @@ def test_real32_rounds_keeps_infinities_and_rejects_overflow(encoding: Encoding)
 # Arguments of callers
 
 
+NO_VALUES = [
+    b"",
+    b"\0\0\0",
+    b"\0\0\0\0\0",
+    "6",
+    None,
+    [1],
+    1j,
+    Decimal("sNaN"),
+    Fraction(10**400),
+    bytearray(4),
+]
+
+
 @pytest.mark.parametrize(
-    ("name", "words"),
+    ("check", "argument", "words"),
     [
-        ("", "at least one"),
-        ("SEVENTEEN_LETTERS", "17 bytes"),
-        ("GRÖSSE", "ASCII"),
-        ("A\0B", "ASCII"),
-        ("A\n", "ASCII"),
-        ("\x7f", "ASCII"),
-        (b"BYTES", "not bytes"),
-        (None, "not NoneType"),
+        (check_name, "", "at least one"),
+        (check_name, "SEVENTEEN_LETTERS", "17 bytes"),
+        *((check_name, name, "ASCII") for name in ("GRÖSSE", "A\0B", "A\n", "\x7f")),
+        (check_name, b"BYTES", "not bytes"),
+        (check_name, None, "not NoneType"),
+        *((check_value, each, "parameter") for each in NO_VALUES),
+        (check_ext_value, "x" * 129, "129 bytes; an extended parameter holds 128"),
+        (check_ext_value, "a\0b", "without NUL"),
+        (check_ext_value, "\ud800", "UTF-8"),
+        (check_ext_value, None, "not NoneType"),
+        (check_ext_value, Decimal("sNaN"), "number in the range of a float"),
     ],
 )
-def test_check_name_rejects(name: Any, words: str) -> None:
+def test_invalid_names_and_values_are_refused(check: Any, argument: Any, words: str) -> None:
     with pytest.raises(UsageError, match=words):
-        check_name(name)
-
-
-@pytest.mark.parametrize(
-    "given_value",
-    [b"", b"\0\0\0", b"\0\0\0\0\0", "6", None, [1], 1j, Decimal("sNaN"), Fraction(10**400), bytearray(4)],
-)
-def test_check_value_rejects(given_value: Any) -> None:
-    with pytest.raises(UsageError, match="parameter"):
-        check_value(given_value)
+        check(argument)
 
 
 # Param
@@ -392,18 +398,3 @@ def test_every_custom_value_can_be_set_again(data: bytes) -> None:
 def test_values_that_do_not_fit(value: Value, number: int, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         encode_ext_value(value, number)
-
-
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
-        ("x" * 129, "129 bytes; an extended parameter holds 128"),
-        ("a\0b", "without NUL"),
-        ("\ud800", "UTF-8"),
-        (None, "not NoneType"),
-        (decimal.Decimal("sNaN"), "number in the range of a float"),
-    ],
-)
-def test_invalid_extended_values_are_refused(value: Settable, words: str) -> None:
-    with pytest.raises(UsageError, match=words):
-        check_ext_value(value)
