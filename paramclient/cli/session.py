@@ -419,7 +419,7 @@ async def _find_by_uid(client: ParamClient, uid: str, timeout: float | None) -> 
             await client.core.link_task.wait_for_activity()
         if found[0].identity.uid != uid:
             await anyio.sleep(HEARTBEAT_WAIT)
-        if len(found := fitting()) == 1:
+        if len(found := fitting() or found) == 1:
             return found[0]
         words = [node_in_words(each.node) for each in found]
         what = f"{len(words)} vehicles on this link have hardware ids that begin with {uid}"

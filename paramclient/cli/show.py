@@ -246,12 +246,12 @@ class _Cached:
 
 def _rank(name: str, info: ParamInfo | None, lowered_words: Sequence[str]) -> int | None:
     """Return 0 if all words are in the name, 1 with the short description, 2 elsewhere; None if not."""
-    texts = [name]
+    text, more = name, [""]
     if info is not None:
         named = [*info.values.values(), *info.bits.values(), info.group]
-        texts += [info.short_description, " ".join([info.long_description, *named])]
-    for rank in range(len(texts)):
-        text = " ".join(texts[: rank + 1]).casefold()
+        more += [info.short_description, " ".join([info.long_description, *named])]
+    for rank, each in enumerate(more):
+        text = f"{text} {each}".casefold()
         if all(word in text for word in lowered_words):
             return rank
     return None
