@@ -76,7 +76,7 @@ async def _check_uses(path: Path, records: Sequence[Record]) -> None:
     link = ReplayLink(LinkSpec(LinkKind.REPLAY, str(path), options=(("speed", 0.0),)))
     await link.open()
     found: list[bytes] = []
-    while not link._is_over:
+    while link._next is not None:
         found += [data for _, data in await link.receive()]
     await link.close()
     assert found == [each.data for each in records]
