@@ -16,7 +16,7 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient import errors
-from paramclient.cli.cached import parse_time
+from paramclient.cache.moments import parse_time
 from paramclient.cli.json_output import JsonObject, apply_json, plan_json, row_json, rows_json
 from paramclient.cli.metadata import MetadataChoice, default_in, known_of_session, no_defaults, say_sources
 from paramclient.cli.options import ApplyFlags

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from paramclient.cache import BY_US, ParamCache, TableState
-from paramclient.cli.cached import parse_time
+from paramclient.cache.moments import parse_time
 from paramclient.errors import UsageError
 from paramclient.model.notation import time_text
 from tests.caches import NOW, PX4, stored, update

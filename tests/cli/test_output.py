@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from paramclient.cli.cached import parse_time
+from paramclient.cache.moments import parse_time
 from paramclient.cli.output import local_time, print_line, print_table, say
 from paramclient.sim import PX4Vehicle
 from tests.commands import Command, Put
