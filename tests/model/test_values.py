@@ -97,8 +97,10 @@ def test_a_plain_param_of_the_type_custom_is_raw() -> None:
 # Byte-wise
 
 
-def check_four_bytes(pattern: int) -> None:
-    """Assert that decoding loses no bit of a 4-byte value, nor does encoding a value that is not raw."""
+@thorough
+@given(patterns)
+def test_four_bytes_round_trip(pattern: int) -> None:
+    """Decoding loses no bit of a 4-byte value, nor does encoding a value that is not raw."""
     raw = pattern.to_bytes(4, "little")
     for kind, layout in ((ParamType.UINT32, "<I"), (ParamType.INT32, "<i")):
         value, bits = decode_value(raw, kind, BYTEWISE)
@@ -115,12 +117,6 @@ def check_four_bytes(pattern: int) -> None:
         else:
             assert encode_value(value, ParamType.REAL32, encoding) == raw
             assert from_bits(bits, ParamType.REAL32) == value
-
-
-@thorough
-@given(patterns)
-def test_four_bytes_round_trip(pattern: int) -> None:
-    check_four_bytes(pattern)
 
 
 @pytest.mark.parametrize(
@@ -305,7 +301,9 @@ def fewest_digits(value: float) -> int:
     raise AssertionError(f"{value!r} needs more than 9 digits")
 
 
-def check_text(pattern: int) -> None:
+@thorough
+@given(patterns)
+def test_format_value_is_the_shortest_round_trip(pattern: int) -> None:
     value = float32(pattern)
     text = format_value(value)
     if math.isfinite(value):
@@ -314,12 +312,6 @@ def check_text(pattern: int) -> None:
         assert len("".join(map(str, digits)).strip("0")) <= fewest_digits(value)
     else:
         assert text == repr(value)
-
-
-@thorough
-@given(patterns)
-def test_format_value_is_the_shortest_round_trip(pattern: int) -> None:
-    check_text(pattern)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from paramclient.errors import UsageError
 from paramclient.model.values import Param, ParamType
 from paramclient.sim import (
     ArduPilotVehicle,
+    Camera,
     FaultyLink,
     GenericVehicle,
     PX4Vehicle,
@@ -44,6 +45,13 @@ class TestTables:
             lambda: GenericVehicle(SMALL).param("NO_SUCH"),
             lambda: GenericVehicle(SMALL).set_param("NO_SUCH", 1),
             lambda: GenericVehicle(SMALL).set_param("C_BYTE", 256),
+            lambda: Camera({"": 1}),
+            lambda: Camera({"A": "x" * 129}),
+            lambda: Camera({"A": (ParamType.UINT8, 300)}),
+            lambda: Camera(supported={"CAM_MODE": ["text"]}),
+            lambda: Camera(component=256),
+            lambda: Camera({"A": 1}).set_ext_param("A", "text"),
+            lambda: Camera({"A": 1}).remove_ext_param("B"),
         ],
     )
     def test_invalid_arguments_are_rejected(self, make: Callable[[], object]) -> None:
