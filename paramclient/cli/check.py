@@ -6,10 +6,9 @@ import platform
 from collections.abc import Awaitable
 from contextlib import suppress
 from statistics import median
-from typing import Annotated, Final, TypeVar
+from typing import Final, TypeVar
 
 import anyio
-from cyclopts import Parameter
 
 from paramclient.cli.json_output import JsonObject, taken, vehicle_json
 from paramclient.cli.options import Seconds, TrafficOptions
@@ -61,7 +60,6 @@ NO_ACKNOWLEDGEMENT: Final = (
     "restart the vehicle's link; with signing, give --signing-key."
 )
 """The finding about a vehicle that acknowledges no command, and what to do about it."""
-_DEFAULTS: Final = TrafficOptions()
 
 Result = TypeVar("Result")
 
@@ -70,9 +68,9 @@ async def check(
     url: str,
     /,
     *,
-    vehicle: Annotated[str | None, Parameter(name="--vehicle")] = None,
+    vehicle: str | None = None,
     timeout: Seconds = None,
-    options: TrafficOptions = _DEFAULTS,
+    options: TrafficOptions = TrafficOptions(),
 ) -> int:
     """Measure a vehicle and its link: identity, services and their speed. Report slow or unusual results.
 

@@ -36,7 +36,6 @@ MEASURE_DELAY: Final = 2.0
 MEASURE_INTERVAL: Final = 4.0
 """Seconds between two reads that measure the round trip: request and response together take less of the link
 than the heartbeats of this client."""
-_DEFAULTS: Final = TrafficOptions()
 
 
 async def link(
@@ -45,7 +44,7 @@ async def link(
     *,
     seconds: Seconds = None,
     listen_only: bool = False,
-    options: TrafficOptions = _DEFAULTS,
+    options: TrafficOptions = TrafficOptions(),
 ) -> None:
     """Print the components on a link, their message rates and the packet loss.
 

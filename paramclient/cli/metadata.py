@@ -42,8 +42,6 @@ METADATA_HINT: Final = (
 )
 """What to do if metadata is not known."""
 
-_DEFAULTS: Final = CacheOptions()
-
 
 def _file(_: object, tokens: Sequence[Token]) -> Metadata:
     """Return the metadata of the file that --metadata names.
@@ -168,7 +166,7 @@ def metadata_add(
     *,
     vehicle: VehicleKind | None = None,
     firmware: str | None = None,
-    options: CacheOptions = _DEFAULTS,
+    options: CacheOptions = CacheOptions(),
 ) -> None:
     """Store a metadata file for a vehicle type and a firmware version, for all commands and the service.
 
@@ -186,7 +184,7 @@ def metadata_add(
     print_result(_added_json(added, metadata), words, json=options.json)
 
 
-def metadata_list(*, options: CacheOptions = _DEFAULTS) -> None:
+def metadata_list(*, options: CacheOptions = CacheOptions()) -> None:
     """Print the metadata files that were added."""
     found = [_added_json(each, read_metadata(each.path)) for each in _files(options)]
     rows = ((each["vehicle"], each["firmware"] or "any", each["descriptions"]) for each in found)
@@ -195,7 +193,7 @@ def metadata_list(*, options: CacheOptions = _DEFAULTS) -> None:
 
 
 def metadata_remove(
-    vehicle: VehicleKind, /, *, firmware: str | None = None, options: CacheOptions = _DEFAULTS
+    vehicle: VehicleKind, /, *, firmware: str | None = None, options: CacheOptions = CacheOptions()
 ) -> None:
     """Remove a metadata file that was added.
 

@@ -1,6 +1,7 @@
 """Options that several subcommands share. The texts below the fields are their help.
 
-The annotations are evaluated at once: cyclopts would look up the names of inherited ones in the module of the
+All are options of the subcommand itself (name `*`), also those of subclasses, which inherit this. The
+annotations are evaluated at once: cyclopts would look up the names of inherited ones in the module of the
 subclass.
 """
 
@@ -10,10 +11,9 @@ from pathlib import Path
 from typing import Annotated, Final, TypeAlias
 
 from cyclopts import Group, Parameter
-from cyclopts.validators import Number
+from cyclopts.validators import MutuallyExclusive, Number
 
 from paramclient.client.signing import Signing, key_from_environment, read_key
-from paramclient.errors import UsageError
 from paramclient.model.values import Encoding
 from paramclient.wire.signing import SigningKey
 
@@ -22,6 +22,9 @@ SOURCE_SYSTEM: Final = 255
 
 CONNECTION: Final = Parameter(group=Group("Connection", sort_key=9))
 """Options of the link, which stand at the end of the help."""
+
+CACHE: Final = Parameter(group=("Parameters", Group("Cache", show=False, validator=MutuallyExclusive())))
+"""The options that name a cache and that use none; both together are an error."""
 
 
 def _check_seconds(_: object, seconds: float | None) -> None:
@@ -79,7 +82,6 @@ class KeyOptions:
         return None if key is None else Signing(key)
 
 
-@Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TrafficOptions(KeyOptions):
     """Options of subcommands that open a link."""
@@ -94,7 +96,6 @@ class TrafficOptions(KeyOptions):
     """Record the link in this new telemetry log."""
 
 
-@Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LinkOptions(TrafficOptions):
     """Options of subcommands that communicate with a vehicle."""
@@ -105,10 +106,10 @@ class LinkOptions(TrafficOptions):
     timeout: Seconds = None
     """Seconds for the whole command. Default: 10 for the first heartbeat."""
 
-    cache: str | None = None
+    cache: Annotated[str | None, CACHE] = None
     """The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache."""
 
-    no_cache: bool = False
+    no_cache: Annotated[bool, CACHE] = False
     """Neither read nor write a cache."""
 
     extended: bool = False
@@ -122,17 +123,10 @@ class LinkOptions(TrafficOptions):
 
     @property
     def place(self) -> str | bool | None:
-        """The cache argument of `ParamClient`.
-
-        Raises:
-            UsageError: --cache and --no-cache are both given.
-        """
-        if self.no_cache and self.cache is not None:
-            raise UsageError("--cache and --no-cache exclude each other")
+        """The cache argument of `ParamClient`."""
         return False if self.no_cache else self.cache
 
 
-@Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class ApplyFlags(LinkOptions):
     """Options of apply and restore."""

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
 
 import anyio
 
@@ -45,8 +44,6 @@ from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.table import Change
 
-_DEFAULTS: Final = LinkOptions()
-
 
 async def fetch(
     url: str,
@@ -55,7 +52,7 @@ async def fetch(
     refresh: bool = False,
     changed: bool = False,
     metadata: MetadataChoice = None,
-    options: LinkOptions = _DEFAULTS,
+    options: LinkOptions = LinkOptions(),
 ) -> int:
     """Fetch all parameters. Uses the cache if the vehicle confirms it, otherwise downloads.
 
@@ -96,7 +93,7 @@ async def get(
     /,
     *names: str,
     metadata: MetadataChoice = None,
-    options: LinkOptions = _DEFAULTS,
+    options: LinkOptions = LinkOptions(),
 ) -> int:
     """Read parameters from the vehicle.
 
@@ -180,7 +177,7 @@ def _report_get(session: CommandSession, errors: Iterable[ParamClientError]) -> 
 # watch
 
 
-async def watch(url: str, /, *names: str, options: LinkOptions = _DEFAULTS) -> int:
+async def watch(url: str, /, *names: str, options: LinkOptions = LinkOptions()) -> int:
     """Print changes of values by any source, as they happen, until Ctrl-C or --timeout.
 
     Updates the table first, and also prints values that have changed since the cache was written. Also prints

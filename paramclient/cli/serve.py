@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import anyio
 
 from paramclient.cli.app import on_end_signal
-from paramclient.cli.options import KeyOptions, Verbose
+from paramclient.cli.options import CACHE, KeyOptions, Verbose
 from paramclient.cli.output import print_line, say
 from paramclient.client.signing import read_key, timestamp_now
 from paramclient.errors import UsageError
@@ -20,7 +20,6 @@ from paramclient.protocol.channel import task_group
 
 SERVICE_LIBRARIES: Final = ("fastapi", "uvicorn")
 """Libraries that the extra `service` installs."""
-_UNSIGNED: Final = KeyOptions()
 
 
 async def serve(
@@ -29,12 +28,12 @@ async def serve(
     *links: str,
     mavlink: tuple[str, ...] = (),
     listen: str = "127.0.0.1:8765",
-    cache: str | None = None,
-    no_cache: bool = False,
+    cache: Annotated[str | None, CACHE] = None,
+    no_cache: Annotated[bool, CACHE] = False,
     listen_only: bool = False,
     tokens: Path | None = None,
     verbose: Verbose = False,
-    options: KeyOptions = _UNSIGNED,
+    options: KeyOptions = KeyOptions(),
 ) -> None:
     """Open links and the cache, and share them with ground stations, programs and browsers.
 
@@ -63,8 +62,6 @@ async def serve(
     _check_extra()
     from paramclient import service  # only here: needs the extra
 
-    if no_cache and cache is not None:
-        raise UsageError("--cache and --no-cache exclude each other")
     hub = service.Hub(
         (link, *links),
         cache=not no_cache if cache is None else cache,

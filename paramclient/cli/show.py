@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final
 
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.cached import load_tables, show_summaries
@@ -49,8 +48,6 @@ from paramclient.model.paramset import Default, ParamSet, add_defaults
 from paramclient.model.values import check_name, format_value
 from paramclient.provision.sources import link_of, read_source, resolve, tables_in
 
-_DEFAULTS: Final = CacheOptions()
-
 
 async def show(
     vehicle: str | None = None,
@@ -59,7 +56,7 @@ async def show(
     changed: bool = False,
     metadata: MetadataFile = None,
     extended: bool = False,
-    options: CacheOptions = _DEFAULTS,
+    options: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Print the cached parameters of a vehicle, or those of a parameter file or a log.
 
@@ -132,7 +129,7 @@ def search(
     *words: str,
     vehicle: str | None = None,
     metadata: MetadataFile = None,
-    options: CacheOptions = _DEFAULTS,
+    options: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Find parameters whose name, description or value names contain all words, in upper or lower case.
 
@@ -177,7 +174,7 @@ def info(
     *,
     vehicle: str | None = None,
     metadata: MetadataFile = None,
-    options: CacheOptions = _DEFAULTS,
+    options: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Print the description, range, value names and cached values of a parameter.
 

@@ -354,7 +354,7 @@ def test_link_is_live_on_a_terminal() -> None:
         (["fetch", "sim:px4", "--no-json"], "--no-json"),
         (["fetch", "sim:px4", "--timeout", "nan"], "seconds above 0"),
         (["fetch", "sim:px4", "--timeout", "0"], "seconds above 0"),
-        (["fetch", "sim:px4", "--cache", "x", "--no-cache"], "exclude each other"),
+        (["fetch", "sim:px4", "--cache", "x", "--no-cache"], "exclusive"),
         (["fetch", "sim:px4", "--encoding", "json"], "bytewise"),
         (["get", "sim:px4", "SEVENTEEN_LETTERS", "--no-cache"], "SEVENTEEN_LETTERS"),
         (["set", "sim:px4"], "pairs"),
