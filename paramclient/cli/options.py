@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Final, TypeAlias
 
 from cyclopts import Group, Parameter
-from cyclopts.validators import MutuallyExclusive, Number
+from cyclopts.validators import Number, mutually_exclusive
 
 from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.model.values import Encoding
@@ -23,7 +23,7 @@ SOURCE_SYSTEM: Final = 255
 CONNECTION: Final = Parameter(group=Group("Connection", sort_key=9))
 """Options of the link, which stand at the end of the help."""
 
-CACHE: Final = Parameter(group=("Parameters", Group("Cache", show=False, validator=MutuallyExclusive())))
+CACHE: Final = Parameter(group=("Parameters", Group("Cache", show=False, validator=mutually_exclusive)))
 """The options that name a cache and that use none; both together are an error."""
 
 
