@@ -16,7 +16,7 @@ from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param, Value, bits_of
-from paramclient.sim import GenericVehicle, Vehicle
+from paramclient.sim import GenericVehicle
 from tests.caches import NOW, PX4, update
 from tests.commands import Command, in_process
 
@@ -224,21 +224,15 @@ def test_a_file_is_read_from_the_standard_input(
 # Links
 
 
-@pytest.fixture
-def vehicles(monkeypatch: pytest.MonkeyPatch) -> dict[str, Vehicle]:
-    """Return the vehicles by URL; all other URLs have none."""
-    known: dict[str, Vehicle] = {}
-
+def test_two_links_are_compared(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     def client(url: str, **options: Any) -> ParamClient:
-        return ParamClient(SimLink(known.pop(url), url), **options)  # each link is opened once
+        return ParamClient(SimLink(vehicles.pop(url), url), **options)  # each link is opened once
 
     monkeypatch.setattr(cli_session, "ParamClient", client)
-    return known
-
-
-def test_two_links_are_compared(command: Command, vehicles: dict[str, Vehicle]) -> None:
-    vehicles["tcp:one:1"] = GenericVehicle({"A": 1, "B": 2})
-    vehicles["tcp:two:1"] = GenericVehicle({"A": 1, "B": 3}, system=7)
+    vehicles = {
+        "tcp:one:1": GenericVehicle({"A": 1, "B": 2}),
+        "tcp:two:1": GenericVehicle({"A": 1, "B": 3}, system=7),
+    }
     outcome = command("diff", "tcp:one:1", "tcp:two:1", "--base", "tcp:one:1", "--json")
     assert (outcome.code, outcome.err) == (1, "")
     assert [

@@ -39,8 +39,17 @@ def test_logs_of_every_format_are_compared(command: Command, tmp_path: Path) -> 
     assert (saved.code, saved.err[:16]) == (0, "903 parameters o")
 
 
-def test_a_damaged_log_is_an_error(command: Command, tmp_path: Path) -> None:
-    path = tmp_path / "broken.ulg"
-    path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + b"\xff" * 50)
-    shown = command("show", path)
-    assert (shown.code, shown.out, shown.err.startswith(f"paramclient: {path}: ")) == (2, "", True)
+@pytest.mark.parametrize(
+    ("name", "content", "kind"),
+    [
+        ("show", b"ULog\x01\x12\x35\x01" + bytes(8) + b"\xff" * 50, "broken.log: "),
+        ("import", b"", "neither a telemetry log"),
+        ("import", b"SQLite format 3\0" + bytes(100), "an SQLite database"),
+    ],
+)
+def test_a_file_that_is_damaged_or_no_log_is_named(
+    command: Command, tmp_path: Path, name: str, content: bytes, kind: str
+) -> None:
+    (path := tmp_path / "broken.log").write_bytes(content)
+    done = command(name, path)
+    assert (done.code, done.out, kind in done.err, done.err.count("\n")) == (2, "", True, 1)

@@ -1,13 +1,11 @@
-"""Tables on narrow terminals, times with their zone, closed outputs, and files that are no logs."""
+"""Tables and lines on narrow terminals, and times with their zone."""
 
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
@@ -92,42 +90,3 @@ def test_times_are_local_with_their_zone_and_can_be_parsed_back(command: Command
     assert parse_time(line["time"], time.time() + 1000) == pytest.approx(
         parse_time(history.rows[1][0], time.time() + 1000)
     )
-
-
-# closed outputs
-
-
-@pytest.mark.parametrize("words", [["-h"], []])
-def test_help_whose_reader_closes_it_is_no_error(words: list[str]) -> None:
-    program = f"import sys; from paramclient.__main__ import main; sys.argv[1:] = {words}; main()"
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as helping:
-        assert helping.stdout is not None
-        assert helping.stderr is not None
-        helping.stdout.close()
-        assert helping.wait(60) == 0
-        assert helping.stderr.read() == b""
-
-
-# import
-
-
-@pytest.mark.parametrize(
-    ("content", "kind"),
-    [
-        (b"", "neither a telemetry log"),
-        (b"SQLite format 3\0" + bytes(100), "an SQLite database"),
-        (None, "No such file or directory"),
-    ],
-)
-def test_import_says_what_a_file_is_that_is_no_log(
-    command: Command, tmp_path: Path, content: bytes | None, kind: str
-) -> None:
-    file = tmp_path / "flight.tlog"
-    if content is not None:
-        file.write_bytes(content)
-    outcome = command("import", file)
-    assert (outcome.code, outcome.out) == (2, "")
-    assert kind in outcome.err
-    assert outcome.err.count("\n") == 1

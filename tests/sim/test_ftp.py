@@ -60,33 +60,6 @@ def packed(vehicle: Vehicle) -> list[PackedParam]:
     return [PackedParam(each.name, ParamType(each.type), each.bits, None) for each in vehicle.params.values()]
 
 
-def content_of(pilot: Pilot, query: bytes) -> param_pck.Pack:
-    pilot.call(Opcode.OPEN_FILE_RO, PARAMS + query)
-    data = b"".join(each.data for each in pilot.burst() if each.opcode == Opcode.ACK)
-    pilot.call(Opcode.TERMINATE_SESSION)
-    return param_pck.decode(data)
-
-
-def test_param_pck_with_start_and_count() -> None:
-    pilot = Pilot(ArduPilotVehicle())
-    everything = packed(pilot.vehicle)
-    assert content_of(pilot, b"?start=5&count=3") == param_pck.Pack(tuple(everything[5:8]), 1382, False)
-    assert content_of(pilot, b"?start=1380") == param_pck.Pack(tuple(everything[1380:]), 1382, False)
-    assert len(content_of(pilot, b"?count=9999").entries) == 1382
-
-
-def test_param_pck_has_the_current_values() -> None:
-    pilot = Pilot(ArduPilotVehicle(live_period=0.0))
-    before = {each.name: each for each in content_of(pilot, b"?withdefaults=1").entries}
-    pilot.vehicle.set_param("RTL_ALT", 1234.0)
-    pilot.vehicle.set_param("COMPASS_DEC", 0.0)
-    after = {each.name: each for each in content_of(pilot, b"?withdefaults=1").entries}
-    assert before["RTL_ALT"].default is None
-    assert after["RTL_ALT"].default == before["RTL_ALT"].bits
-    assert before["COMPASS_DEC"].default == 0
-    assert after["COMPASS_DEC"].default is None
-
-
 class TestSessions:
     def test_px4_closes_a_session_after_11_s(self) -> None:
         pilot = Pilot(PX4Vehicle())

@@ -104,13 +104,3 @@ def test_sys_autoconfig_resets_all_but_kept_parameters() -> None:
     reboot(station)
     station.wait(5.0)
     assert vehicle.param("SYS_HAS_MAG").value == 0  # resets only once
-
-
-def test_first_start_only_parameters_are_unused_from_the_second_start_on() -> None:
-    px4 = PX4Vehicle()
-    states = [(len(px4.params), px4.announced_hash())]
-    for at in (5.0, 10.0):
-        px4.reboot(at, down=1.0)
-        states.append((len(px4.params), px4.announced_hash()))
-    assert states[1] == states[2] != states[0]
-    assert states[1][0] == states[0][0] - 3
