@@ -7,7 +7,6 @@ import os
 import stat
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -41,63 +40,52 @@ def test_the_extension_selects_the_format_to_write(ending: str, form: FileFormat
     assert listed(tmp_path) == [path.name]
 
 
-def test_replacing_a_file_keeps_its_mode(tmp_path: Path) -> None:
-    path = tmp_path / "quad.param"
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    """A file that is there already, alone in its folder."""
+    path = tmp_path / "real/quad.param"
+    path.parent.mkdir()
     path.write_bytes(OLD)
     path.chmod(0o640)
-    write_file(path, PARAMS)
-    assert read_file(path).choose()["A"].value == 5
-    assert stat.S_IMODE(path.stat().st_mode) == 0o640
-    assert listed(tmp_path) == ["quad.param"]
+    return path
 
 
-def test_a_symbolic_link_is_kept(tmp_path: Path) -> None:
-    folder = tmp_path / "real"
-    folder.mkdir()
-    (folder / "quad.param").write_bytes(OLD)
+def test_a_replaced_file_keeps_its_mode_and_a_symbolic_link_to_it(old: Path, tmp_path: Path) -> None:
     link = tmp_path / "link.param"
-    link.symlink_to(folder / "quad.param")
-    write_file(link, PARAMS)
-    assert link.is_symlink()
-    assert read_file(folder / "quad.param").choose()["A"].value == 5
-    assert listed(folder) == ["quad.param"]
-
-
-def test_an_interrupted_write_leaves_the_old_file_unchanged(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def interrupted(_: int) -> None:
-        raise KeyboardInterrupt
-
-    path = tmp_path / "quad.param"
-    path.write_bytes(OLD)
-    monkeypatch.setattr(os, "fsync", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    link.symlink_to(old)
+    for path in (old, link):
+        old.write_bytes(OLD)
         write_file(path, PARAMS)
-    assert (path.read_bytes(), listed(tmp_path)) == (OLD, ["quad.param"])
+        assert read_file(old).choose()["A"].value == 5
+        assert stat.S_IMODE(old.stat().st_mode) == 0o640
+        assert listed(old.parent) == [old.name]
+    assert link.is_symlink()
 
 
-@pytest.mark.parametrize("call", ["fchmod", "fsync"])
-def test_a_full_disk_leaves_the_old_file_unchanged(
-    call: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize(
+    ("call", "fault"), [("fsync", KeyboardInterrupt()), ("fsync", FULL), ("fchmod", FULL)], ids=repr
+)
+def test_a_write_that_fails_leaves_the_old_file_unchanged(
+    call: str, fault: BaseException, old: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    def fail(*_: object) -> None:
+        raise fault
 
-    path = tmp_path / "quad.param"
-    path.write_bytes(OLD)
-    monkeypatch.setattr(os, call, full)
-    error = refused(lambda: write_file(path, PARAMS))
+    monkeypatch.setattr(os, call, fail)
+    with pytest.raises((KeyboardInterrupt, FileError)) as caught:
+        write_file(old, PARAMS)
     monkeypatch.undo()
-    assert str(error) == f"{path}: cannot be written: No space left on device"
-    assert isinstance(error.__cause__, OSError)
-    assert path.read_bytes() == OLD
-    assert listed(tmp_path) == ["quad.param"]
+    if fault is FULL:
+        assert str(caught.value) == f"{old}: cannot be written: No space left on device"
+        assert caught.value.__cause__ is FULL
+    assert (old.read_bytes(), listed(old.parent)) == (OLD, [old.name])
 
 
-def test_inexpressible_content_fails_before_writing(tmp_path: Path) -> None:
-    path = tmp_path / "quad.params"
-    path.write_bytes(OLD)
+def test_inexpressible_content_fails_before_writing(old: Path) -> None:
+    path = old.rename(old.with_suffix(".params"))
     error = refused(lambda: write_file(path, PARAMS))
     assert str(error) == f"{path}: B has no type that MAVLink defines, and this format needs one"
     assert path.read_bytes() == OLD
