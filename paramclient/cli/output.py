@@ -41,29 +41,19 @@ GAP: Final = "  "
 SENTENCE_WIDTH_MIN: Final = 20
 """Columns that sentences in the last column of a table take at least; in less they are hard to read."""
 
-_RIGHT_ALIGNED: Final = frozenset(
-    {
-        *("value", "index", "default", "before", "wanted", "requested", "actual", "now", "left", "right"),
-        *("base", "old", "new", "id", "params", "extended", "descriptions", "v", "frames/s", "bytes/s"),
-        *("loss", "round trip", "heartbeat"),
-    }
-)
-"""Headings of columns with numbers."""
 _WHOLE: Final[dict[str, Any]] = {
     "break_long_words": False,
     "break_on_hyphens": False,
     "replace_whitespace": False,
 }
 """Options of `textwrap` with which words and blanks stay as they are."""
-_STYLED: Final = frozenset({"status", "is", "changed", "severity"})
-"""Headings of columns with outcomes, differences and findings."""
 _STYLES: Final = {
     **dict.fromkeys(("set", "accepted", "only right"), "32"),
     **dict.fromkeys(("later", "adjusted", "unproven", "different", "slow"), "33"),
     **dict.fromkeys(("refused", "invalid", "unknown", "only left", "conflict", "problem"), "31"),
     **dict.fromkeys(("skipped", "not tried"), "2"),
 }
-"""Codes of the styles of these on a terminal: green, yellow, red and dim."""
+"""Codes of the styles of outcomes, differences and findings on a terminal: green, yellow, red and dim."""
 
 
 def printable(text: str) -> str:
@@ -141,28 +131,28 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Non
 
     Args:
         columns: the headings.
-        rows: the cells of each row; None is an empty cell. A column without any cell is left out.
+        rows: the cells of each row; None is an empty cell. A column without any cell is left out; one with
+            numbers is aligned at the right.
     """
-    cells, is_terminal = [*rows], sys.stdout.isatty()
-    kept = [at for at in range(len(columns)) if not cells or any(row[at] is not None for row in cells)]
-    names = [columns[at] for at in kept]
-    table: list[list[object]] = [[*names], *([row[at] for at in kept] for row in cells)]
-    texts = [["" if cell is None else printable(str(cell)) for cell in row] for row in table]
-    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
-    begin = sum(len(GAP) + each for each in widths[:-1])  # of the last column
-    left = max(shutil.get_terminal_size().columns - begin, SENTENCE_WIDTH_MIN)
-    for words in texts:
-        line = ""
-        if is_terminal:
-            words[-1] = f"\n{' ' * begin}".join(_fold(words[-1], left))
-        for text, width, name in zip(words, widths, names, strict=True):
-            padding, shown = " " * (width - len(text)), text
-            if is_terminal:
-                style = _STYLES.get(text.partition(", ")[0]) if name in _STYLED else None
-                shown = _styled(text, "1" if words is texts[0] else style)
-            line += (padding + shown if name in _RIGHT_ALIGNED else shown + padding) + GAP
-        print(line.rstrip())
-    sys.stdout.flush()
+    cells, begin = [*rows], 0
+    kept = [
+        column
+        for column in zip(columns, *cells, strict=True)
+        if not cells or any(cell is not None for cell in column[1:])
+    ]
+    lines = [""] * (len(cells) + 1)
+    for column in kept:
+        texts = ["" if cell is None else printable(str(cell)) for cell in column]
+        if column is kept[-1] and sys.stdout.isatty():
+            left = max(shutil.get_terminal_size().columns - begin, SENTENCE_WIDTH_MIN)
+            texts = [f"\n{' ' * begin}".join(_fold(text, left)) for text in texts]
+        width, is_number = max(map(len, texts)), any(isinstance(cell, int | float) for cell in column)
+        for at, text in enumerate(texts):
+            style = _STYLES.get(text.partition(", ")[0]) if at else "1"
+            shown, padding = _styled(text, style), " " * (width - len(text))
+            lines[at] += (padding + shown if is_number else shown + padding) + GAP
+        begin += width + len(GAP)
+    print("\n".join(line.rstrip() for line in lines), flush=True)
 
 
 def show(
@@ -197,7 +187,8 @@ def clear_screen() -> None:
 
 
 def _styled(text: str, style: str | None) -> str:
-    return text if style is None or "NO_COLOR" in os.environ else f"\x1b[{style}m{text}\x1b[0m"
+    is_plain = style is None or "NO_COLOR" in os.environ or not sys.stdout.isatty()
+    return text if is_plain else f"\x1b[{style}m{text}\x1b[0m"
 
 
 # Questions

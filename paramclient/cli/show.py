@@ -10,6 +10,7 @@ from paramclient.cli.json_output import (
     JsonObject,
     info_json,
     known_members,
+    param_value,
     set_json,
     table_param_json,
     taken,
@@ -45,7 +46,7 @@ from paramclient.model.identity import autopilot_name, has_autopilot
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import time_text
 from paramclient.model.paramset import Default, ParamSet, add_defaults
-from paramclient.model.values import check_name, format_value
+from paramclient.model.values import check_name
 from paramclient.provision.sources import link_of, read_source, resolve, tables_in
 
 
@@ -153,7 +154,7 @@ def search(
         tables, info = known.having(name), known.info(name)
         description = (info and info.short_description) or None
         found.append({"name": name, "description": description, "vehicles": [each.key for each in tables]})
-        values = {format_value(each.params[name].settable, each.params[name].type) for each in tables}
+        values = {param_value(each.params[name]) for each in tables}
         value = f"{len(values)} values" if len(values) > 1 else next(iter(values), None)
         where = ", ".join(f"{each.system}/{each.component}" for each in tables)
         rows.append((name, value, where, description))

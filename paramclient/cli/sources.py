@@ -294,14 +294,14 @@ def _print(found: JsonObject) -> None:
         print_table(["name", "left", "right", "base", "units", "is", "changed"], rows)
 
 
-def _shown(side: JsonObject | None) -> str | None:
+def _shown(side: JsonObject | None) -> object:
     """Return a value with its meaning, if known: `5 (Loiter)`. `info` prints all names of a bit mask."""
     if side is None:
         return None
     meaning = side.get("text", "")
     if len(meaning) > MEANING_LENGTH_MAX:
         meaning = f"{meaning[:MEANING_LENGTH_MAX]}..."
-    return f"{side['value']} ({meaning})" if meaning else str(side["value"])
+    return f"{side['value']} ({meaning})" if meaning else side["value"]
 
 
 def _summary(found: JsonObject) -> str:
