@@ -13,7 +13,7 @@ import anyio.to_thread
 import pytest
 
 from paramclient import ParamClient
-from paramclient.cli import run
+from paramclient.cli import run, signing
 from paramclient.cli import session as cli_session
 from paramclient.links import SimLink
 from paramclient.sim import Endpoint
@@ -82,11 +82,14 @@ def behind(monkeypatch: pytest.MonkeyPatch, url: str) -> Put:
     """Return a function that connects every URL to a vehicle or a link, and returns `url`."""
 
     def place(far_end: Endpoint | SimLink | PeersLink) -> str:
+        def link_of(url: str) -> SimLink | PeersLink:
+            return far_end if isinstance(far_end, SimLink | PeersLink) else SimLink(far_end, url)
+
         def client(url: str, **options: Any) -> ParamClient:
-            link = far_end if isinstance(far_end, SimLink | PeersLink) else SimLink(far_end, url)
-            return ParamClient(link, **options)
+            return ParamClient(link_of(url), **options)
 
         monkeypatch.setattr(cli_session, "ParamClient", client)
+        monkeypatch.setattr(signing, "create_link", link_of)
         return url
 
     return place

@@ -15,10 +15,8 @@ from pathlib import Path
 import pytest
 
 from paramclient import SigningKey
-from paramclient.cli import signing as signing_commands
 from paramclient.client.signing import timestamp_now
-from paramclient.links import SimLink
-from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle
 from paramclient.wire import frames, messages
 from tests.commands import Command, Put
 from tests.shell import VALUES, small_px4
@@ -26,18 +24,6 @@ from tests.shell import VALUES, small_px4
 URL = "sim:custom"
 KEY = SigningKey(bytes(range(101, 133)))
 OTHER_KEY = SigningKey(bytes(range(1, 33)))
-
-
-@pytest.fixture
-def put(put: Put, monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every URL to a simulated vehicle, also for the subcommands that open the link themselves."""
-
-    def place(vehicle: Vehicle) -> str:
-        link = SimLink(vehicle, URL)
-        monkeypatch.setattr(signing_commands, "create_link", lambda _: link)
-        return put(link)
-
-    return place  # type: ignore[return-value]  # no links here
 
 
 @pytest.fixture

@@ -13,14 +13,13 @@ import pytest
 from paramclient import ParamCache, ParamClient
 from paramclient.cache import TableState
 from paramclient.cli import session as cli_session
-from paramclient.cli import signing as signing_commands
 from paramclient.links import SimLink
 from paramclient.model.identity import Identity
-from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import messages
 from tests.caches import NOW, stored, update
 from tests.commands import Command, Put, behind
-from tests.shell import Late, PeersLink, Tap
+from tests.shell import Late, Tap
 
 URL = "udpin:0.0.0.0:14550"
 SOURCE = "udpin:0.0.0.0:14551"
@@ -34,19 +33,6 @@ Words: TypeAlias = Callable[[str], list[str]]
 """Returns the arguments of a subcommand."""
 QUESTIONS = (messages.Heartbeat, messages.CommandLong)
 """What identifies vehicles."""
-
-
-@pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Connect every link to simulated vehicles."""
-    place = behind(monkeypatch, URL)
-
-    def both(far_end: Endpoint | SimLink | PeersLink) -> str:
-        link = far_end if isinstance(far_end, SimLink | PeersLink) else SimLink(far_end, URL)
-        monkeypatch.setattr(signing_commands, "create_link", lambda _: link)
-        return place(far_end)
-
-    return both
 
 
 @pytest.fixture
