@@ -190,7 +190,7 @@ def _add(group: App, function: str, arguments: str | None = None, *examples: str
 _add(_app, "read_commands:fetch", "URL [NAME...]", "sim:px4 'MC_*'", "tcp:127.0.0.1:5760 --vehicle 3 --json")
 _add(_app, "read_commands:get", "URL NAME [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_P 'MC_PITCH*'")
 _add(_app, "set_command:set_", "URL NAME VALUE [NAME VALUE...]", "sim:px4 MC_ROLL_P 6.5 MC_PITCH_P 6.5")
-_add(_app, "apply:reset", "URL NAME [NAME...]|--all|--changed", "sim:ardupilot 'RTL_*' --dry-run")
+_add(_app, "apply:reset", "URL NAME [NAME...]|--all", "sim:ardupilot 'RTL_*' --dry-run")
 _add(_app, "read_commands:watch", "URL [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_P --json")
 _add(_app, "link:link", None, "udpin:0.0.0.0:14550 --seconds 10 --json")
 _add(_app, "check:check", None, "udpin:0.0.0.0:14550")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Sequence
@@ -23,7 +22,7 @@ from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import ExitCode, Status, can_ask, code_of, confirm, listed, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, check_given, get_chosen, sessions
 from paramclient.cli.set_command import write_all
-from paramclient.cli.sources import check_pattern, described, fill_pattern, is_pattern_name, resolve_all
+from paramclient.cli.sources import described, filled, is_pattern_name, resolve_all
 from paramclient.files import FileFormat, ParamFile
 from paramclient.model.names import age_in_words, counted, is_pattern
 from paramclient.model.paramset import ParamSet
@@ -39,8 +38,8 @@ _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be reve
 """Words for planned actions in the summary, where they differ from the status."""
 _INCLUDABLE: Final = frozenset(CATEGORIES) - {READ_ONLY}
 """Categories of left-out parameters that --include writes; the vehicle lets no client write the others."""
-_SNAPSHOT: Final = re.compile("[0-9]{1,18}")
-"""The number of a snapshot; all other texts are times."""
+SNAPSHOT_DIGITS_MAX: Final = 18
+"""Digits of the number of a snapshot; all other texts are times."""
 _OPTIONS: Final = ApplyFlags()
 
 
@@ -53,12 +52,14 @@ class State:
         is_restore: whether they are an earlier state of the vehicle.
         partial: whether invalid values and unknown names are skipped.
         is_part: whether values are missing, so that the command cannot end as complete.
+        to_continue: how to continue after an interruption.
     """
 
     params: ParamSet
     is_restore: bool = False
     partial: bool = True
     is_part: bool = False
+    to_continue: str = "run it again to continue"
 
 
 Load: TypeAlias = Callable[[CommandSession], Awaitable[State]]
@@ -114,19 +115,16 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
             --snapshots`; or a backup file. Default: the state before the last apply, unless a restore ran
             since then. With --vehicle all, a time, or a backup file with {uid} or {system} in its name.
     """
-    if when is not None and (is_file(when) or is_pattern_name(when)):
-        check_pattern("the backup file", when, options)
+    if when is None:
+        return await _run(url, options, bind(_earlier_state, None))
+    number = int(when) if when.isdecimal() and len(when) <= SNAPSHOT_DIGITS_MAX else None
+    if (number or is_file(when)) and ChosenVehicle.parse(options.vehicle).is_all:
+        hint = "with --vehicle all, give a time, or a file with {uid} or {system} in its name"
+        raise errors.UsageError(f"{when} is the state of one vehicle; {hint}")
+    if is_file(when) or is_pattern_name(when):
         load, options = await _from_file(when, options, is_restore=True)
         return await _run(url, options, load)
-    if options.place is False:
-        raise errors.UsageError(
-            "earlier states are in the cache, which --no-cache excludes; name a backup file"
-        )
-    moment: float | int | None = None
-    if when is not None:
-        moment = int(when) if _SNAPSHOT.fullmatch(when) else parse_time(when, time.time())
-    if isinstance(moment, int) and ChosenVehicle.parse(options.vehicle).is_all:
-        raise errors.UsageError(f"snapshot {when} is of one vehicle; with --vehicle all, give a time")
+    moment = parse_time(when, time.time()) if number is None else number
     return await _run(url, options, bind(_earlier_state, moment))
 
 
@@ -135,7 +133,6 @@ async def reset(
     /,
     *names: str,
     all_: Annotated[bool, Parameter(name="--all")] = False,
-    changed: bool = False,
     metadata: MetadataChoice = None,
     options: ApplyFlags = _OPTIONS,
 ) -> int:
@@ -151,13 +148,12 @@ async def reset(
         names: The parameters, in upper or lower case, or patterns such as "MC_*".
         all_: Reset all parameters, except those that apply leaves out: identity, calibration, counters and so
             on, see --include.
-        changed: The same, without a complaint about single parameters whose default is not known.
         metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
     """
-    if bool(names) + all_ + changed != 1:
-        raise errors.UsageError("reset takes names, or --all, or --changed")
+    if bool(names) == all_:
+        raise errors.UsageError("reset takes names, or --all")
     chosen = check_given(names)
-    load = bind(_defaults, chosen or ["*"], metadata, only_known=changed)
+    load = bind(_defaults, chosen or ["*"], metadata)
     flags = replace(options, include=(*options.include, *(name.upper() for name in chosen)))
     return await _run(url, flags, load, metadata)
 
@@ -165,7 +161,9 @@ async def reset(
 # The values to write
 
 
-async def _from_file(name: str, options: ApplyFlags, **kind: bool) -> tuple[Load, ApplyFlags]:
+async def _from_file(
+    name: str, options: ApplyFlags, *, partial: bool = True, is_restore: bool = False
+) -> tuple[Load, ApplyFlags]:
     """Return what gives each vehicle its values of a file, and the options for the kind of its parameters.
 
     The file may also be a vehicle of the cache or a link; one with placeholders in its name is read for each
@@ -175,7 +173,7 @@ async def _from_file(name: str, options: ApplyFlags, **kind: bool) -> tuple[Load
     Args:
         name: the file.
         options: the options of the subcommand.
-        kind: `partial` and `is_restore` of the state.
+        partial, is_restore: as in `State`.
     """
     source: ParamFile | None = None
     if is_file(name):
@@ -184,18 +182,16 @@ async def _from_file(name: str, options: ApplyFlags, **kind: bool) -> tuple[Load
         source = ParamFile((*await resolve_all([name], options, writes=True),), FileFormat.JSON, name)
 
     async def load(session: CommandSession) -> State:
-        file, path = source, name
-        if file is None and is_file(path := await fill_pattern(name, session)):
-            file = read_source(path)
+        path = filled(name, session.component, session.label)
+        file = source or (read_source(path) if is_file(path) else None)
         if file is None:
             raise errors.FileError("no such file", source=path)
         params = choose(file, session.choice.component, session.component.system)
-        await wait_for_identity(session.component)
         own, origin = session.component.identity, params.identity
-        is_named = session.choice.uid is not None or (own.uid is not None and own.uid in params.source)
-        if is_named and own.uid is not None and (origin is None or origin.uid is None):
-            params = replace(params, identity=own if origin is None else replace(origin, uid=own.uid))
-        return State(params, is_part=file.left_out > 0, **kind)
+        has_uid = origin is not None and origin.uid is not None
+        if own.uid and not has_uid and (session.choice.uid or own.uid in params.source):
+            params = replace(params, identity=replace(origin or own, uid=own.uid))
+        return State(params, is_restore, partial, is_part=file.left_out > 0)
 
     is_extended = options.extended or (source is not None and source.is_extended)
     return load, replace(options, extended=is_extended)
@@ -209,15 +205,14 @@ async def _earlier_state(moment: float | int | None, session: CommandSession) ->
     """
     cache, vehicle = session.client.cache, session.component
     if cache is None:
-        raise errors.NotInCache("earlier states are in the cache, which cannot be used")
-    await wait_for_identity(vehicle)
+        raise errors.UsageError("earlier states are in the cache, which is not used; name a backup file")
     await vehicle.core.cache_writer.write_all()
-    place = (vehicle.identity.key, vehicle.component)
-    find = bind(load_restore_point, cache, *place, extended=vehicle.is_extended)
-    read = bind(cache.state_at, *place, extended=vehicle.is_extended)
+    place, extended = (vehicle.identity.key, vehicle.component), vehicle.is_extended
     try:
         if moment is not None:
-            return State(await anyio.to_thread.run_sync(read, moment), is_restore=True)
+            read = bind(cache.state_at, *place, moment, extended=extended)
+            return State(await anyio.to_thread.run_sync(read), is_restore=True)
+        find = bind(load_restore_point, cache, *place, extended=extended)
         point = await anyio.to_thread.run_sync(find)
     except errors.NotInCache:
         raise
@@ -228,12 +223,12 @@ async def _earlier_state(moment: float | int | None, session: CommandSession) ->
     when = f"{age_in_words(time.time() - point.at)} ago (snapshot {point.snapshot})"
     changed = listed([*point.changes]) or "nothing, as far as is known"
     say(f"{session.prefix}the state is that before the last apply, {when}; changed since then: {changed}")
-    return State(point.state, is_restore=True)
+    again = f"restore {session.client.link.name} {point.snapshot} --vehicle {session.address}"
+    again += " --extended" if extended else ""
+    return State(point.state, is_restore=True, to_continue=f"to continue: paramclient {again}")
 
 
-async def _defaults(
-    chosen: Sequence[str], choice: MetadataChoice, session: CommandSession, *, only_known: bool
-) -> State:
+async def _defaults(chosen: Sequence[str], choice: MetadataChoice, session: CommandSession) -> State:
     """Return the firmware's defaults of the chosen parameters.
 
     Raises:
@@ -253,7 +248,7 @@ async def _defaults(
     if not wanted:
         raise errors.VehicleError(no_defaults(), *session.component.address)
     say_sources(session.label, found.values())
-    without = [] if only_known else [name for name in found if name not in wanted]
+    without = [name for name in found if name not in wanted]
     if is_cut := bool(missing) and any(map(is_pattern, chosen)):
         report(f"{session.prefix}incomplete: {counted(len(missing), 'parameter')} not received")
     if without:
@@ -279,24 +274,26 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
     Raises:
         FileError: a file of --backup exists, or names several vehicles' backups, or a vehicle has no file.
     """
-    check_pattern("the file of --backup", flags.backup, flags)
     async with sessions(url, flags, writes=True) as found:
         jobs, backups = dict[CommandSession, _Job](), set[str]()
 
         async def prepare(session: CommandSession) -> None:
+            await wait_for_identity(session.component)
+            backup = None
+            if flags.backup is not None:
+                backup = filled(flags.backup, session.component, session.label)
+                exists = await anyio.Path(backup).exists()
+                if exists or backup in backups:
+                    problem = "exists already, or is another vehicle's; a name may have {uid} or {system}"
+                    raise errors.FileError(problem, source=backup)
+                backups.add(backup)
             state, include = await load(session), flags.include
             if state.is_restore:
                 say(f"{session.prefix}the state: {described(state.params)}")
                 include += await restore_categories(session.component, state.params)
             info = await known_of_session(session, metadata)
-            options = ApplyOptions(include=include, info=info, partial=state.partial, reboot=flags.reboot)
-            options["allow_armed"] = flags.allow_armed
-            if flags.backup is not None:
-                options["backup"] = path = await fill_pattern(flags.backup, session)
-                if path in backups or await anyio.Path(path).exists():
-                    message = "exists already, or is the backup of another vehicle; choose another name"
-                    raise errors.FileError(message, source=path)
-                backups.add(path)
+            options = ApplyOptions(include=include, info=info, partial=state.partial, backup=backup)
+            options |= {"reboot": flags.reboot, "allow_armed": flags.allow_armed}
             jobs[session] = _Job(session, state, options)
 
         await found.work(prepare)
@@ -305,7 +302,7 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
                 raise error
         if flags.dry_run or (not flags.yes and not flags.json and can_ask()):
             plans = await found.work(lambda session: jobs[session].make_plan())
-            has_work = any(job.has_work for job in jobs.values())
+            has_work = any(job.has_work for job in plans.values())
             if flags.dry_run or has_work:
                 code = found.show(plans)
             if flags.dry_run:
@@ -323,6 +320,7 @@ class _Job:
         session: the vehicle.
         state: the values to write.
         options: the options of the run.
+        has_work: whether the plan writes something.
         found: the plan; while it is written, the outcomes so far; and at the end the result.
     """
 
@@ -331,6 +329,7 @@ class _Job:
     session: CommandSession
     state: State
     options: ApplyOptions
+    has_work: bool = False
     found: Rows = field(default_factory=lambda: Rows({}))
 
     async def make_plan(self) -> Self:
@@ -342,7 +341,10 @@ class _Job:
         session, left = self.session, self.session.deadline.left()
         include, info = self.options["include"], self.options["info"]
         with anyio.move_on_after(left):
-            self.found = await plan(session.component, self.state.params, include=include, info=info)
+            self.found = made = await plan(session.component, self.state.params, include=include, info=info)
+            is_refused = made.problems and not self.options["partial"]
+            is_reboot_due = self.options["reboot"] and made.awaiting_reboot
+            self.has_work = not is_refused and bool(made.to_write or is_reboot_due)
             return self
         raise errors.NoReply(f"the parameters of {session.label}", attempts=0, waited=left or 0.0)
 
@@ -360,25 +362,13 @@ class _Job:
             session.announce_write()
 
         self.found = Rows(arrived)
-        title = f"setting {session.label}"
-        more = ApplyOptions(timeout=session.deadline.left(), progress=update, before_writing=announce)
+        title, options = f"setting {session.label}", self.options
+        options |= {"timeout": session.deadline.left(), "progress": update, "before_writing": announce}
         with Status(f"{title}: waiting for the first response", title) as status:
             self.found = await run_apply(
-                session.component, state.params, {**self.options, **more}, is_restore=state.is_restore
+                session.component, state.params, options, is_restore=state.is_restore
             )
         return self
-
-    @property
-    def has_work(self) -> bool:
-        """Whether there is a plan that writes something."""
-        made = self.found
-        if not isinstance(made, Plan) or self._is_refused(made):
-            return False
-        return bool(made.to_write or (self.options["reboot"] and made.awaiting_reboot))
-
-    def _is_refused(self, made: Plan) -> bool:
-        """Return whether the plan has problems, and nothing is written because of them."""
-        return bool(made.problems) and not self.options["partial"]
 
     def as_json(self) -> JsonObject:
         """Return the JSON of the plan or the result; after an interruption, of the outcomes so far."""
@@ -405,49 +395,44 @@ class _Job:
         Returns:
             The exit code; of a plan, the one that the command is expected to have.
         """
-        found, session, remarks = self.found, self.session, list[str]()
+        found, session, options = self.found, self.session, self.options
         words = ", ".join(f"{count} {_WORDS.get(status, status)}" for status, count in found.counts.items())
-        summary = f"{session.receiver}: {words or 'nothing to set'}"
+        summary, remarks = f"{session.receiver}: {words or 'nothing to set'}", list[str]()
+        done = [row for row in found.rows.values() if row.status not in _WORDS]
+        is_part = self.state.is_part or not all(row.is_as_wanted for row in done)
+        code = ExitCode.INCOMPLETE if is_part else ExitCode.DONE
         if isinstance(found, Plan):
-            made, end, code, late = found, "; nothing was sent", self._judge(found), found.reboot_for
-            late += found.awaiting_reboot if self.options["reboot"] else ()
+            made, end, late = found, "; nothing was sent", found.reboot_for
+            if session.component.is_armed and not options["allow_armed"]:
+                remarks.append("armed; nothing would be set now without --allow-armed")
+                code = ExitCode.INCOMPLETE
+            if found.problems and not options["partial"]:
+                remarks.append(f"nothing would be sent without --partial: {listed([*found.problems])}")
+                code = ExitCode.USAGE
             remarks.append(found.firmware_note)
+            if options["reboot"] and (reboot_for := late + found.awaiting_reboot):
+                remarks.append(f"reboots for: {listed(reboot_for)}")
+                late = ()
         elif isinstance(found, ApplyResult):
             made, end, late = found.plan, f" in {found.elapsed:.1f} s", found.reboot_required
-            code = ExitCode.DONE if found.complete else ExitCode.INCOMPLETE
             if found.system != session.component.system:
                 remarks.append(f"the vehicle is {found.system}/{found.component} now")
-        else:  # interrupted
-            say(summary)
-            return ExitCode.DONE
+            if found.error is not None:
+                remarks.append(f"{found.error}; {self.state.to_continue}")
+                code = max(code, code_of(found.error))
+        else:
+            say(f"{summary}; {self.state.to_continue}")
+            return code
         say(f"{summary}{end}")
-        remarks.append(made.unchecked_note)
         skipped = [row.category for row in found.of(ApplyStatus.SKIPPED) if row.differs]
         if left_out := Counter(category for category in skipped if category in _INCLUDABLE):
             counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
-            options = " ".join(f"--include {category}" for category in left_out)
-            remarks.append(f"left out: {counts}; to write them: {options}")
+            includes = " ".join(f"--include {category}" for category in left_out)
+            remarks.append(f"left out: {counts}; to write them: {includes}")
         if late:
-            reboots = found is made and self.options["reboot"]
-            remarks.append(f"{'reboots for' if reboots else 'takes effect after a reboot'}: {listed(late)}")
-        for remark in filter(None, remarks):
+            remarks.append(f"takes effect after a reboot: {listed(late)}")
+        for remark in filter(None, [made.unchecked_note, *remarks]):
             say(f"{session.label}: {remark}")
-        if isinstance(found, ApplyResult) and found.error is not None:
-            report(f"{session.label}: {found.error}; run it again to continue")
-            code = max(code, code_of(found.error))
-        return max(code, ExitCode.INCOMPLETE) if self.state.is_part else code
-
-    def _judge(self, made: Plan) -> ExitCode:
-        """Print whether nothing would be written now; return the exit code that the command would have."""
-        label, code = self.session.label, ExitCode.DONE
-        if any(not row.is_as_wanted for row in made.of(ApplyStatus.SKIPPED, ApplyStatus.INVALID)):
-            code = ExitCode.INCOMPLETE
-        if self.session.component.is_armed and not self.options["allow_armed"]:
-            report(f"{label} is armed; nothing would be set now without --allow-armed")
-            code = ExitCode.INCOMPLETE
-        if self._is_refused(made):
-            report(f"{label}: nothing would be sent without --partial: {listed([*made.problems])}")
-            code = ExitCode.USAGE
         return code
 
 

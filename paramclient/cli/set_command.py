@@ -158,7 +158,7 @@ async def write_all(found: Sessions, jobs: Mapping[CommandSession, WriteJob]) ->
         return found.show(await found.work(lambda session: jobs[session].write()))
     except anyio.get_cancelled_exc_class():
         found.show(jobs)
-        say("interrupted: the values without a proof may be in flight; run it again to continue")
+        say("interrupted: the values without a proof may be in flight")
         raise
 
 

@@ -16,6 +16,7 @@ from paramclient.cli.metadata import MetadataFile, defaults_in, known_of_sets, n
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import ExitCode, listed, local_time, print_json, print_table, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
+from paramclient.client.component import Component
 from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, writable, write_file
 from paramclient.files.formats import ENDINGS, address, format_of_name
@@ -26,7 +27,6 @@ from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.paramset import ParamSet, default_of
 from paramclient.provision import sources
-from paramclient.provision.inspection import wait_for_identity
 
 _ENDINGS: Final = frozenset({*ENDINGS, ".bin", ".ulg", ".txt", ".csv"})
 """Extensions of files with parameters, also of formats that are not readable: a text with one of them is
@@ -184,11 +184,10 @@ async def save(
         sets = [part for each in sets if (part := part_of(each, names))]
     files: dict[str, list[ParamSet]] = {}
     for each in sets:
-        uid = None if each.identity is None else each.identity.uid
         kept, left_out = writable(each, written)
         if left_out:
             report(f"{address(each)}: left out, as only a .json file can hold them: {listed(left_out)}")
-        files.setdefault(filled(str(file), each.system, uid, address(each)), []).append(kept)
+        files.setdefault(filled(str(file), each, address(each)), []).append(kept)
     found: list[JsonObject] = []
     for path, of_file in files.items():
         await anyio.to_thread.run_sync(bind(write_file, path, of_file, file_format=written))
@@ -340,34 +339,13 @@ def is_pattern_name(name: str) -> bool:
     return "{uid}" in name or "{system}" in name
 
 
-def check_pattern(what: str, pattern: str | None, options: LinkOptions) -> None:
-    """Check that a file name has a placeholder if there may be several vehicles.
-
-    Raises:
-        UsageError: it has none.
-    """
-    is_all = ChosenVehicle.parse(options.vehicle).is_all
-    if pattern is not None and is_all and not is_pattern_name(pattern):
-        raise UsageError(f"with --vehicle all, {what} needs {{uid}} or {{system}} in its name: {pattern}")
-
-
-async def fill_pattern(pattern: str, session: CommandSession) -> str:
-    """Return a file name with the placeholders replaced by the vehicle's ids.
+def filled(pattern: str, vehicle: Component | ParamSet, label: str) -> str:
+    """Return a file name with the placeholders replaced by the ids of a vehicle, which is `label` in words.
 
     Raises:
         UsageError: the name has `{uid}`, and the vehicle reports no hardware id.
     """
-    if "{uid}" in pattern:
-        await wait_for_identity(session.component)
-    return filled(pattern, session.component.system, session.component.identity.uid, session.label)
-
-
-def filled(pattern: str, system: int | None, uid: str | None, label: str) -> str:
-    """Return a file name with the placeholders replaced; `label` is the vehicle in words.
-
-    Raises:
-        UsageError: the name has `{uid}`, and the vehicle reports no hardware id.
-    """
+    uid = None if vehicle.identity is None else vehicle.identity.uid
     if uid is None and "{uid}" in pattern:
         raise UsageError(f"{label} does not report a hardware id, which {pattern} needs")
-    return pattern.replace("{uid}", uid or "").replace("{system}", str(system))
+    return pattern.replace("{uid}", uid or "").replace("{system}", str(vehicle.system))

@@ -126,7 +126,7 @@ def test_armed_vehicles_are_refused(command: Command, put: Put, file: File) -> N
     assert (outcome.code, outcome.out, vehicle.requests["PARAM_SET"]) == (1, "", 0)
     assert ("armed" in outcome.err, "writing to" in outcome.err) == (True, False)
     would = command("apply", put(vehicle), file(), "--dry-run")
-    assert (would.code, "1/1 ardupilot is armed" in would.err) == (1, True)
+    assert (would.code, "1/1 ardupilot: armed; nothing would be set now" in would.err) == (1, True)
     assert command("apply", put(vehicle), file(), "--dry-run", "--allow-armed").code == 0
     assert command("apply", put(vehicle), file(), "--allow-armed").code == 0
 
@@ -356,9 +356,9 @@ def test_one_file_or_state_for_all_vehicles_is_refused(
         (["apply", tmp_path / "{system}.param"], "2.param: no such file"),
         (["apply", file(), "--vehicle", 2], "vehicle"),
         (["restore", file()], "{uid} or {system} in its name"),
-        (["restore", 1], "snapshot 1 is of one vehicle"),
+        (["restore", 1], "1 is the state of one vehicle"),
         (["restore", "--backup", "same.json"], "{uid} or {system}"),
-        (["restore", "--no-cache"], "--no-cache"),
+        (["restore", "--no-cache"], "in the cache, which is not used"),
         (["restore", tmp_path / "none-{system}.param"], "no such file"),
     ):
         name, *more = words
@@ -400,7 +400,8 @@ def test_ctrl_c_prints_the_outcomes_so_far(
         wanted = [f"{each}=2" for each in names]
     outcome = command(name, put(vehicle), *wanted, *(["--json"] if as_json else []))
     assert outcome.code == 130
-    assert re.search("^interrupted: .*; run it again", outcome.err, re.MULTILINE)
+    assert re.search("^interrupted: ", outcome.err, re.MULTILINE)
+    assert ("; run it again to continue" in outcome.err) == (name == "apply")
     assert any(value == 2 for value in vehicle.values.values())
     if not as_json:
         place = 4 if name == "apply" else -1
@@ -422,14 +423,15 @@ def test_an_interrupted_restore_is_continued_by_its_number(command: Command, put
     assert command("apply", put(GenericVehicle(dict.fromkeys(names, 1))), wanted).code == 0
     vehicle = Interrupting(dict.fromkeys(names, 2))
     outcome = command("restore", put(vehicle))
-    assert (outcome.code, "(snapshot 1)" in outcome.err) == (130, True)
+    next_command = "to continue: paramclient restore udpin:0.0.0.0:14550 1 --vehicle 1/1\n"
+    assert (outcome.code, next_command in outcome.err) == (130, True)
     assert set(vehicle.values.values()) == {1, 2}
     again = command("restore", put(vehicle))
     assert (again.code, "snapshot 1 for the state before that apply, also to continue" in again.err) == (
         2,
         True,
     )
-    back = command("restore", put(vehicle), 1)
+    back = command("restore", put(vehicle), 1, "--vehicle", "1/1")
     assert (back.code, set(vehicle.values.values())) == (0, {1})
 
 

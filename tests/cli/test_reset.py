@@ -58,7 +58,7 @@ def test_named_parameters_get_the_defaults_of_the_vehicle_and_restore_undoes_it(
     assert vehicle.values == before
 
 
-@pytest.mark.parametrize("words", [["A"], ["--all"], ["--changed"]])
+@pytest.mark.parametrize("words", [["A"], ["--all"]])
 def test_without_any_known_default_nothing_is_written(command: Command, put: Put, words: list[str]) -> None:
     tap = Tap(GenericVehicle(table={"A": 5.0, "B": 6.0}))
     done = command("reset", put(tap), *words)
@@ -78,7 +78,6 @@ def test_defaults_of_metadata_are_used_where_the_vehicle_gives_none(
     words = ["reset", put(vehicle), "--all", "--metadata", described]
     planned = command(*words, "--dry-run")
     assert (planned.code, "as their default is not known: B\n" in planned.err) == (1, True)
-    assert command("reset", words[1], "--changed", *words[3:], "--dry-run").code == 0
     assert [row[:3] for row in planned.rows[1:]] == [["A", "5.0", "2.5"]]
     done = command(*words, "--json")
     assert {name: each["status"] for name, each in done.json["params"].items()} == {"A": "accepted"}
@@ -96,10 +95,7 @@ def test_the_metadata_of_the_vehicle_is_downloaded_where_it_gives_no_defaults(
     assert said in done.err
 
 
-@pytest.mark.parametrize("choice", ["--all", "--changed"])
-def test_what_apply_leaves_out_is_left_out_unless_it_is_named(
-    command: Command, put: Put, choice: str
-) -> None:
+def test_what_apply_leaves_out_is_left_out_unless_it_is_named(command: Command, put: Put) -> None:
     rows = [
         SimParam("BARO1_GND_PRESS", ParamType.REAL32, 101325.0, default=0.0),
         SimParam("COMPASS_OFS_X", ParamType.REAL32, 5.0, default=0.0),
@@ -108,15 +104,15 @@ def test_what_apply_leaves_out_is_left_out_unless_it_is_named(
     vehicle = copter(table=rows, read_only=["BARO1_GND_PRESS"])
     vehicle.set_param("RTL_ALT", 2000)
     tap = Tap(vehicle)
-    done = command("reset", put(tap), choice)
+    done = command("reset", put(tap), "--all")
     assert (done.code, {*written(tap)}) == (0, {"RTL_ALT"}), done.err
     assert "--include" in done.err
-    assert command("reset", put(vehicle), choice, "--include", "calibration").code == 0
+    assert command("reset", put(vehicle), "--all", "--include", "calibration").code == 0
     assert vehicle.values["COMPASS_OFS_X"] == 0.0
     named = command("reset", put(vehicle), "baro1_gnd_press")
     assert (named.code, named.rows[1][-2]) == (1, "refused")
 
 
-@pytest.mark.parametrize("words", [[], ["A", "--all"], ["--all", "--changed"]])
-def test_names_all_and_changed_exclude_each_other(command: Command, put: Put, words: list[str]) -> None:
+@pytest.mark.parametrize("words", [[], ["A", "--all"]])
+def test_names_and_all_exclude_each_other(command: Command, put: Put, words: list[str]) -> None:
     assert command("reset", put(copter()), *words).code == 2
