@@ -330,29 +330,6 @@ def test_link_is_live_on_a_terminal() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (["fetch", "sim:px4", "--bogus"], "--bogus"),
-        (["fetch", "sim:px4", "--no-json"], "--no-json"),
-        (["fetch", "sim:px4", "--timeout", "nan"], "seconds above 0"),
-        (["fetch", "sim:px4", "--timeout", "0"], "seconds above 0"),
-        (["fetch", "sim:px4", "--cache", "x", "--no-cache"], "exclusive"),
-        (["fetch", "sim:px4", "--encoding", "json"], "bytewise"),
-        (["get", "sim:px4", "SEVENTEEN_LETTERS", "--no-cache"], "SEVENTEEN_LETTERS"),
-        (["set", "sim:px4"], "pairs"),
-        (["watch", "sim:px4", "ÄÖÜ"], "ASCII"),
-        (["history"], "VEHICLE"),
-    ],
-)
-def test_bad_arguments_are_exit_code_2(command: Command, arguments: list[str], text: str) -> None:
-    outcome = command(*arguments)
-    assert (outcome.code, outcome.out) == (2, "")
-    assert outcome.err.startswith("paramclient: ")
-    assert outcome.err.count("\n") == 1
-    assert text in outcome.err
-
-
-@pytest.mark.parametrize(
     ("words", "awaited"),
     [
         ("fetch --timeout 0.1 --no-cache --json", "an autopilot"),

@@ -88,6 +88,10 @@ def both() -> Air:
 
 FETCH: Final = "fetch URL"
 FETCH_EXTENDED: Final = "fetch URL --vehicle 1/100 --extended"
+CHANGE_EXTENDED: Final = (
+    "save URL TMP/before.json --vehicle 1/100 --extended",
+    "set URL CAM_NAME Rear --vehicle 1/100 --extended",
+)
 CASES: Final = {
     "fetch_px4": Case(quad, (FETCH + " --json", FETCH + " MC_* --json")),
     "fetch_ardupilot": Case(copter, (FETCH + " --json", FETCH + " --changed --json")),
@@ -139,27 +143,14 @@ CASES: Final = {
         ),
     ),
     "diff_defaults": Case(
-        copter,
-        (
-            FETCH,
-            "diff 1 DATA/json/quad.param --base defaults --metadata DATA/apm.pdef.xml --json",
-        ),
+        copter, (FETCH, "diff 1 DATA/json/quad.param --base defaults --metadata DATA/apm.pdef.xml --json")
     ),
     "diff_extended": Case(
-        camera,
-        (
-            "save URL TMP/before.json --vehicle 1/100 --extended",
-            "set URL CAM_NAME Rear --vehicle 1/100 --extended",
-            "diff URL TMP/before.json --vehicle 1/100 --extended --json",
-        ),
+        camera, (*CHANGE_EXTENDED, "diff URL TMP/before.json --vehicle 1/100 --extended --json")
     ),
     "search": Case(
         copter,
-        (
-            FETCH,
-            "search rtl alt --metadata DATA/apm.pdef.xml --json",
-            "search nothing_of_this --json",
-        ),
+        (FETCH, "search rtl alt --metadata DATA/apm.pdef.xml --json", "search nothing_of_this --json"),
     ),
     "info": Case(
         copter,
@@ -194,8 +185,7 @@ CASES: Final = {
     "apply_extended": Case(
         camera,
         (
-            "save URL TMP/before.json --vehicle 1/100 --extended",
-            "set URL CAM_NAME Rear --vehicle 1/100 --extended",
+            *CHANGE_EXTENDED,
             "apply URL TMP/before.json --vehicle 1/100 --extended --dry-run --json",
             "apply URL TMP/before.json --vehicle 1/100 --extended --json",
         ),
@@ -212,17 +202,13 @@ CASES: Final = {
     "restore_extended": Case(
         camera,
         (
-            "save URL TMP/before.json --vehicle 1/100 --extended",
-            "set URL CAM_NAME Rear --vehicle 1/100 --extended",
+            *CHANGE_EXTENDED,
             "apply URL TMP/before.json --vehicle 1/100 --extended --json",
             "restore URL --vehicle 1/100 --extended --json",
         ),
     ),
     "import": Case(None, ("import DATA/px4_full_download.tlog DATA/ardupilot_flight.bin --json",)),
-    "cache": Case(
-        quad,
-        (FETCH, "cache list --json", "cache remove 1 --json"),
-    ),
+    "cache": Case(quad, (FETCH, "cache list --json", "cache remove 1 --json")),
     "metadata": Case(
         None,
         (

@@ -61,18 +61,6 @@ def test_the_most_exact_version_that_fits_is_used(tmp_path: Path) -> None:
     assert maximum(files, COPTER, component=100) is None, "a camera"
 
 
-def test_files_are_replaced_and_removed(tmp_path: Path) -> None:
-    files = AddedFiles(tmp_path / "added")
-    for value in (5, 6):
-        added, metadata = files.add(described(tmp_path, "ArduCopter", value), firmware="4.6")
-        assert (added.kind, added.firmware, len(metadata)) == ("copter", "4.6", 2)
-    assert maximum(files, COPTER) == 6
-    with pytest.raises(UsageError, match=r"added: copter 4\.6"):
-        files.remove("copter")
-    assert files.remove("copter", "4.6").firmware == "4.6"
-    assert maximum(files, COPTER) is None
-
-
 def test_a_file_must_be_metadata_of_a_known_vehicle(tmp_path: Path) -> None:
     files = AddedFiles(tmp_path / "added")
     with pytest.raises(UsageError, match="names no vehicle type"):

@@ -17,7 +17,6 @@ from paramclient import ParamCache, ParamClient
 from paramclient.errors import (
     AnotherVehicle,
     CacheError,
-    InvalidParameters,
     LinkError,
     NoReply,
     UsageError,
@@ -32,7 +31,6 @@ from paramclient.provision import (
     ApplyResult,
     ApplyStatus,
     apply,
-    for_each,
     plan,
     restore,
 )
@@ -205,29 +203,6 @@ async def test_the_state_is_stored_before_anything_is_sent(
     assert first.before["TUNE_01"].value == SETTINGS["TUNE_01"]
 
 
-async def test_a_silent_vehicle_ends_the_run_and_the_next_run_continues() -> None:
-    tap = Tap(vehicle := ardupilot())
-
-    def fall_silent(progress: ApplyProgress) -> None:
-        if progress.phase == "writing" and progress.done == 5:
-            tap.is_deaf = tap.is_mute = True
-
-    async with a_client(tap) as client:
-        component = await client.component()
-        result = await apply(component, WANTED, progress=fall_silent)
-        assert isinstance(result.error, NoReply)
-        assert not result.complete
-        assert result.counts[ApplyStatus.UNPROVEN] >= 5
-        assert result.counts[ApplyStatus.UNPROVEN] + result.counts[ApplyStatus.UNKNOWN] == len(WANTED)
-        assert result.rows["TUNE_29"].reason.startswith("no reply: the acknowledgement of TUNE_29 by 1/1")
-        tap.is_deaf = tap.is_mute = False
-        await anyio.sleep(3)
-        again = await apply(component, WANTED)
-    assert again.complete
-    assert again.counts[ApplyStatus.UNCHANGED] >= 5
-    assert all(vehicle.param(name).value == value for name, value in WANTED.items())
-
-
 async def test_a_failed_link_ends_the_run_with_the_rows_so_far() -> None:
     link = FlakyLink(ardupilot())
     async with a_client(link) as client:
@@ -292,18 +267,6 @@ async def test_the_state_of_another_vehicle_is_refused() -> None:
         component = await client.component()
         with pytest.raises(UsageError, match="is that of another vehicle: the ardupilot 616e6f74686572"):
             await restore(component, other.before)
-
-
-async def test_a_call_for_each_vehicle_has_a_result_or_an_error_for_each() -> None:
-    vehicles: list[Vehicle] = [ardupilot(), px4(system=2), ardupilot(system=3)]
-    own: dict[int, Table] = {1: {}, 2: {"TUNE_02": 42.0}, 3: {"SMALL": 1000}}
-    async with a_client(Air(vehicles)) as client:
-        await client.fetch_all()
-        components = [client.components[vehicle.system, 1] for vehicle in vehicles]
-        done = await for_each(components, lambda each: apply(each, WANTED | own[each.system]))
-    assert (list(done.results), list(done.errors), done.complete) == ([(1, 1), (2, 1)], [(3, 1)], False)
-    assert isinstance(done.errors[3, 1], InvalidParameters)
-    assert [vehicle.param("TUNE_02").value for vehicle in vehicles] == [1.5, 42.0, 0.5]
 
 
 async def test_a_vehicle_armed_during_the_run_ends_it() -> None:

@@ -91,43 +91,6 @@ class TestPX4:
         assert vehicle.values == before
         assert not station.receive(messages.ParamError)
 
-    @pytest.mark.parametrize(
-        ("name", "value", "changed"),
-        [
-            ("MPC_TILTMAX_LND", 80.0, {"MPC_TILTMAX_LND": 45.0}),
-            ("MPC_XY_VEL_MAX", 3.0, {"MPC_VEL_MANUAL": 3.0, "MPC_XY_CRUISE": 3.0}),
-            ("MPC_THR_HOVER", 0.0625, {"MPC_THR_HOVER": 0.12}),
-        ],
-    )
-    def test_the_position_controller_enforces_limits(
-        self, name: str, value: float, changed: dict[str, float]
-    ) -> None:
-        vehicle = PX4Vehicle()
-        station = Station(vehicle).wait(0.3).send(write(name, value, ParamType.REAL32))
-        station.wait(0.39)
-        assert vehicle.values[name] == value
-        station.wait(2.0)
-        expected = {name: value, **changed}
-        assert {each: vehicle.values[each] for each in expected} == pytest.approx(expected)
-        assert {each.param_id for each in station.values()} == expected.keys()
-
-    def test_parameters_not_in_use(self) -> None:
-        vehicle = PX4Vehicle(table=SMALL, not_in_use=["B_INT"])
-        before = vehicle.announced_hash()
-        station = Station(vehicle)
-        assert names(station.ask(LIST)) == ["_HASH_CHECK", "A_FLOAT", "C_BYTE", "D_SHORT"]
-        (value,) = station.ask(read("B_INT"))
-        assert value == messages.ParamValue("B_INT", b"\x07\0\0\0", ParamType.INT32, 3, NO_INDEX)
-        (value,) = station.ask(write("B_INT", 8, ParamType.INT32))
-        assert (value.raw, value.param_index) == (b"\x08\0\0\0", NO_INDEX)
-        assert vehicle.announced_hash() == before
-        assert vehicle.param("B_INT") == Param("B_INT", 8, ParamType.INT32, None, 8)
-        vehicle.use("B_INT")
-        assert vehicle.announced_hash() != before
-        assert indices(station.ask(read("B_INT"), read("C_BYTE"))) == [1, 2]
-        vehicle.reboot(station.now)
-        assert list(vehicle.values) == ["A_FLOAT", "C_BYTE", "D_SHORT"]
-
     def test_a_calibration_id_brings_others_into_use(self) -> None:
         vehicle = PX4Vehicle()
         fourth = vehicle.param("CAL_MAG3_ID").index
