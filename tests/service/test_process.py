@@ -95,7 +95,7 @@ async def test_it_wants_a_token_of_its_file(tmp_path: Path) -> None:
     [
         (2, ["sim:px4", "--listen", "0.0.0.0:0"], "--tokens"),
         (2, ["sim:px4", "--tokens", "no-such-file"], "no-such-file"),
-        (2, ["sim:px4", "--cache", "a", "--no-cache"], "exclude"),
+        (2, ["sim:px4", "--cache", "a", "--no-cache"], "exclusive"),
         (2, ["sim:px4", "sim:px4"], "twice"),
         (2, [], "LINK"),
         (
