@@ -5,7 +5,7 @@ Each function returns one object that `json.dumps` accepts; docs/json.md describ
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -62,6 +62,11 @@ def short_text(text: str | None) -> str | None:
 # Parameters
 
 
+def info_of(metadata: Metadata | None, name: str) -> ParamInfo | None:
+    """Return the metadata of a parameter, or None."""
+    return None if metadata is None else metadata.find(name)
+
+
 def param_value(param: Param | None) -> Scalar | None:
     """Return the value of a parameter; None for None."""
     return None if param is None else value_json(param.settable, param.type)
@@ -86,19 +91,8 @@ def param_json(param: Param, info: ParamInfo | None = None, *, whole: bool = Fal
         info: its metadata, or None.
         whole: whether to include all metadata.
     """
-    default = default_of(param, None if info is None else info.default)
-    return {
-        "value": param_value(param),
-        "type": param.type.name,
-        "index": param.index,
-        "bits": bits_text(param),
-    } | known_members(
-        default=default and value_json(default.value, param.type),
-        default_source=default and default.source,
-        text=info and short_text(info.text(param.settable)),
-        units=info and short_text(info.units),
-        metadata=info_json(info) if info and whole else None,
-    )
+    found: JsonObject = {"value": param_value(param), "type": param.type.name, "index": param.index}
+    return {**found, "bits": bits_text(param), **_described(param, info, whole=whole)}
 
 
 def table_param_json(param: Param, info: ParamInfo | None = None, *, whole: bool = False) -> JsonObject:
@@ -111,18 +105,30 @@ def table_param_json(param: Param, info: ParamInfo | None = None, *, whole: bool
     }
 
 
-def written_json(param: WrittenParam, default_source: str | None = None) -> JsonObject:
-    """Return a parameter of a file or of another set, with the origin of its default if that is given."""
-    return compared_json(param) | known_members(
-        default=None if param.default is None else value_written(param.default, param),
-        default_source=default_source,
-        comment=param.comment or None,
+def written_json(param: WrittenParam, info: ParamInfo | None = None, *, whole: bool = False) -> JsonObject:
+    """Return a parameter of a file or of another set, as `param_json` does."""
+    return compared_json(param) | _described(param, info, whole=whole, comment=param.comment or None)
+
+
+def _described(
+    param: Param | WrittenParam, info: ParamInfo | None, *, whole: bool, comment: str | None = None
+) -> JsonObject:
+    """Return the default of a parameter, its comment, and its metadata."""
+    default = default_of(param, None if info is None else info.default)
+    kind = ParamType.REAL64 if param.type is None else param.type
+    return known_members(
+        default=default and value_json(default.value, kind),
+        default_source=default and default.source,
+        comment=comment,
+        text=info and short_text(info.text(param.settable)),
+        units=info and short_text(info.units),
+        metadata=info_json(info) if info and whole else None,
     )
 
 
 def compared_json(param: WrittenParam, metadata: Metadata | None = None) -> JsonObject:
     """Return a parameter of one side of a comparison, with the meaning of its value."""
-    info = None if metadata is None else metadata.find(param.name)
+    info = info_of(metadata, param.name)
     return {
         "value": value_written(param.settable, param),
         "type": None if param.type is None else param.type.name,
@@ -157,9 +163,11 @@ def origin_json(params: ParamSet) -> JsonObject:
     }
 
 
-def set_json(params: ParamSet, sources: Mapping[str, str] | None = None) -> JsonObject:
-    """Return a set with its parameters by name, and with the origins of its defaults where they are given."""
-    written = {name: written_json(each, (sources or {}).get(name)) for name, each in params.items()}
+def set_json(params: ParamSet, metadata: Metadata | None = None, *, whole: bool = False) -> JsonObject:
+    """Return a set with its parameters by name; with `whole`, with all their metadata."""
+    written = {
+        name: written_json(each, info_of(metadata, name), whole=whole) for name, each in params.items()
+    }
     return {**origin_json(params), "params": written}
 
 
@@ -179,8 +187,7 @@ def fetch_json(
         "elapsed_s": round(result.elapsed, 4),
         **taken(component.core.link_task, "bytes_received", "bytes_sent"),
         "params": {
-            each.name: param_json(each, None if metadata is None else metadata.find(each.name))
-            | {"trust": each.trust}
+            each.name: param_json(each, info_of(metadata, each.name)) | {"trust": each.trust}
             for each in params
         },
     }

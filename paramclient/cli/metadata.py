@@ -14,7 +14,7 @@ import anyio.to_thread
 from cyclopts import Parameter, Token
 
 from paramclient.cache import ParamCache
-from paramclient.cli.json_output import JsonObject
+from paramclient.cli.json_output import JsonObject, info_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import Status, print_result, say, show
 from paramclient.cli.session import CommandSession, wait_for_firmware
@@ -23,7 +23,6 @@ from paramclient.metadata import (
     AddedMetadata,
     Metadata,
     MetadataStore,
-    ParamInfo,
     VehicleKind,
     metadata_of,
     read_metadata,
@@ -121,11 +120,6 @@ def known_of_sets(
     if given is not None or options.place is False:
         return [given] * len(sets)
     return MetadataStore.beside(ParamCache(options.cache).path).known_of_sets(sets)
-
-
-def info_of(metadata: Metadata | None, name: str) -> ParamInfo | None:
-    """Return the metadata of a parameter, or None."""
-    return None if metadata is None else metadata.find(name)
 
 
 # Defaults

@@ -9,11 +9,10 @@ from functools import partial
 
 import anyio
 
-from paramclient.cli.json_output import JsonObject, fetch_json, param_json, param_value, taken
+from paramclient.cli.json_output import JsonObject, fetch_json, info_of, param_json, param_value, taken
 from paramclient.cli.metadata import (
     MetadataChoice,
     default_in,
-    info_of,
     known_of_session,
     no_defaults,
     say_sources,

@@ -13,8 +13,8 @@ import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from paramclient.cli.json_output import JsonObject, outcome_json, vehicle_json
-from paramclient.cli.metadata import MetadataChoice, info_of, known_of_session
+from paramclient.cli.json_output import JsonObject, info_of, outcome_json, vehicle_json
+from paramclient.cli.metadata import MetadataChoice, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Status, code_of, report, require_consent, say
 from paramclient.cli.session import CommandSession, Sessions, Shown, sessions, spelling

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.cached import load_tables, show_summaries
 from paramclient.cli.json_output import (
-    JsonObject,
     info_json,
-    known_members,
+    info_of,
     param_value,
     set_json,
     table_param_json,
@@ -20,7 +19,6 @@ from paramclient.cli.metadata import (
     MetadataFile,
     default_in,
     defaults_in,
-    info_of,
     known_of_sets,
     no_defaults,
     say_sources,
@@ -45,7 +43,7 @@ from paramclient.model.comparison import non_defaults
 from paramclient.model.identity import autopilot_name, has_autopilot
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import time_text
-from paramclient.model.paramset import Default, ParamSet, add_defaults
+from paramclient.model.paramset import add_defaults
 from paramclient.model.values import check_name
 from paramclient.provision.sources import link_of, read_source, resolve, tables_in
 
@@ -88,40 +86,27 @@ async def show(
     everything = {name for each in sets for name in each}
     kept = NameChoice(chosen).choose(everything) if chosen else everything
     views = []
-    for whole, info in zip(sets, known_of_sets(sets, options, metadata), strict=True):
+    for whole, known in zip(sets, known_of_sets(sets, options, metadata), strict=True):
         part = part_of(whole, kept)
-        shown = add_defaults(part, defaults_in(info, part))
-        defaults = {name: default for name, each in part.items() if (default := default_in(info, each))}
-        views.append((non_defaults(shown) if changed else shown, info, defaults))
+        defaults = {name: default for name, each in part.items() if (default := default_in(known, each))}
+        shown = part_of(part, non_defaults(add_defaults(part, defaults_in(known, part)))) if changed else part
+        views.append((shown, known, defaults))
     if changed and not any(defaults for _, _, defaults in views):
         report(no_defaults())
         return ExitCode.INCOMPLETE
-    items = [_json(*view, is_chosen=bool(chosen)) for view in views]
+    items = [set_json(shown, known, whole=bool(chosen)) for shown, known, _ in views]
     if options.json:
         print_json({"components": items})
         return ExitCode.DONE
-    for (shown, info, defaults), item in zip(views, items, strict=True):
+    for (shown, known, defaults), item in zip(views, items, strict=True):
         columns = ("name", "value", "default", "type", "meaning", "units", "comment")
         print_table(columns, cells_of(item["params"], *columns[1:]))
-        for name in shown if chosen and info is not None else ():
-            _print_description(name, info_of(info, name))
+        for name in shown if chosen and known is not None else ():
+            _print_description(name, info_of(known, name))
         say(described(shown) + (", those that differ from their default" if changed else ""))
         if changed:
             say_sources(address(shown), [defaults[name] for name in shown])
     return ExitCode.DONE
-
-
-def _json(
-    shown: ParamSet, metadata: Metadata | None, defaults: Mapping[str, Default], *, is_chosen: bool
-) -> JsonObject:
-    """Return the JSON of a set; of chosen parameters with all their metadata."""
-    found = set_json(shown, {name: default.source for name, default in defaults.items()})
-    for name, param in found["params"].items():
-        if (info := info_of(metadata, name)) is not None:
-            text, units = info.text(shown[name].settable), info.units
-            param |= known_members(text=text or None, units=units or None)
-            param |= {"metadata": info_json(info)} if is_chosen else {}
-    return found
 
 
 def search(
