@@ -17,8 +17,6 @@ SMALL: dict[str, Value | tuple[ParamType | int, Value]] = {
     "D_SHORT": (ParamType.INT16, -3),
 }
 LIST = messages.ParamRequestList(1, 1)
-PERIODIC_MESSAGES = (messages.Heartbeat, messages.SystemTime)
-"""Messages that a generic vehicle sends each second from the first call on."""
 
 M = TypeVar("M")
 

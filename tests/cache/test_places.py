@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import sqlite3
 import subprocess
 import sys
@@ -12,17 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from paramclient.cache import ParamCache, default_path
+from paramclient.cache import ParamCache
 from paramclient.errors import CacheError, UsageError
 from tests.cache.conftest import Open
 from tests.caches import (
     CACHE_ALONE,
-    full_disk,
-    read_only,
     rubbish,
     set_aside,
-    stored,
-    update,
     values,
     whole_table,
 )
@@ -37,15 +32,6 @@ def filled(path: Path) -> Path:
     with ParamCache(path) as cache:
         cache.save(whole_table(3))
     return path
-
-
-def test_the_users_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    assert default_path().is_relative_to(Path.home()), "of a test, which has a home of its own"
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert default_path() == tmp_path / "paramclient" / "parameters.sqlite3"
-    with ParamCache() as cache:
-        assert cache.path == default_path()
-        assert cache.place == str(default_path())
 
 
 def test_only_a_write_creates_a_file_and_only_for_the_user(path: Path) -> None:
@@ -113,37 +99,7 @@ def test_a_file_that_is_no_cache_is_renamed_with_one_warning(
     assert [record.getMessage() for record in caplog.records] == [note]
 
 
-def test_two_programs_find_one_damaged_file(path: Path) -> None:
-    filled(path)
-    with ParamCache(path) as one, ParamCache(path) as other:
-        assert len(one.components()) == len(other.components()) == 1
-        path.write_bytes(rubbish(20_000))
-        for cache in (one, other):
-            cache.save(whole_table(2))
-        assert values(one) == values(other) == {"PARAM_0": 0, "PARAM_1": 1}
-    assert len(set_aside(path)) == 1
-
-
-def test_a_deleted_file_is_noticed(path: Path) -> None:
-    with ParamCache(path) as cache:
-        cache.save(whole_table(2))
-        before = cache.replacements
-        shutil.rmtree(path.parent)
-        cache.save(update(stored("PARAM_0", 7)))
-        assert cache.replacements == before + 1
-        assert values(cache) == {"PARAM_0": 7}
-
-
 # what cannot be written
-
-
-def test_a_folder_in_which_nothing_can_be_written(path: Path) -> None:
-    filled(path)
-    with read_only(path.parent), ParamCache(path) as cache:
-        assert len(values(cache)) == 3
-        with pytest.raises(CacheError, match="cannot be used"):
-            cache.save(whole_table(1))
-        assert len(values(cache)) == 3
 
 
 def test_a_place_that_cannot_be(tmp_path: Path) -> None:
@@ -152,16 +108,6 @@ def test_a_place_that_cannot_be(tmp_path: Path) -> None:
         cache.save(whole_table(1))
     with pytest.raises(UsageError, match="not valid"):
         ParamCache("postgresql://a b")
-
-
-def test_a_full_disk_loses_nothing(path: Path) -> None:
-    filled(path)
-    with ParamCache(path) as cache:
-        with full_disk(100), pytest.raises(CacheError, match="cannot be used"):
-            cache.save(whole_table(200))
-        assert len(values(cache)) == 3
-        cache.save(whole_table(4))
-        assert len(values(cache)) == 4
 
 
 # several processes

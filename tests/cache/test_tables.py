@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
-from paramclient.errors import CacheError, UsageError
+from paramclient.errors import UsageError
 from paramclient.model.px4_hash import hash_bits
 from paramclient.model.values import Param, ParamType, Trust, ext_param, from_bits
 from tests.cache.conftest import Open
@@ -121,14 +121,6 @@ def test_another_firmware_has_other_defaults(cache: ParamCache) -> None:
     table = cache.component("1")
     assert (table.params["A"].default, table.file_works) == (None, None)
     assert table.params["A"].value == 1
-
-
-def test_a_closed_cache_is_an_error(cache: ParamCache) -> None:
-    cache.close()
-    with pytest.raises(CacheError, match="closed"):
-        cache.vehicles()
-    with pytest.raises(CacheError, match="closed"):
-        cache.save(whole_table(1))
 
 
 def test_a_durable_write_is_on_the_disk(cache: ParamCache, open_cache: Open) -> None:

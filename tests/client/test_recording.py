@@ -238,9 +238,6 @@ async def test_a_stream_that_drops_is_not_continued(tmp_path: Path) -> None:
     assert lines == ["line 2"]
 
 
-WATCHED = "paramclient"
-
-
 def test_the_command_logs_its_steps(capsys: pytest.CaptureFixture[str]) -> None:
     level = logging.getLogger("paramclient").level
     for option, code, name in (("-v", 0, "MC_ROLL_P"), ("--verbose", 2, "BAD\x1b[31m")):

@@ -10,7 +10,7 @@ import pytest
 
 from paramclient.errors import ParamErrorCode
 from paramclient.model.values import ParamType, Trust
-from paramclient.protocol.fetch import FetchResult, Progress, fetch_all
+from paramclient.protocol.fetch import FetchResult, fetch_all
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle, px4_table
 from paramclient.wire import messages
 from tests.conversations.virtual import Silence, Tap, converse, meanwhile, run, talking, virtual_on_both
@@ -231,12 +231,3 @@ async def test_a_value_outside_the_hash_that_is_not_received_is_missing() -> Non
         assert (result.missing, result.cached) == ((secret.index,), (secret.name,))
         assert result.params[secret.name].trust is Trust.CACHED
         assert any(secret.name in note for note in result.notes)
-
-
-async def test_progress_rises_to_the_count() -> None:
-    async with converse(PX4Vehicle()) as conversation:
-        seen: list[Progress] = []
-        result = await fetch_all((await conversation.node()).plain, progress=seen.append)
-        received = [each.received for each in seen]
-        assert received == sorted(received)
-        assert (seen[-1].received, seen[-1].total) == (result.count, result.count)

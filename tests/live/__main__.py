@@ -30,13 +30,6 @@ from tests.live.choice import choose
 from tests.live.journal import Journal, check_disarmed
 from tests.live.relay import CLEAN, Relay
 
-HOW_TO_CALL: Final = """\
-usage: make live LINK=udpin:127.0.0.1:14550 [KIND=px4|ardupilot] [SYSTEM=1] [ONLY='fetch'] [READ_ONLY=yes]
-                 [LINK2=udpin:127.0.0.1:14540] [REBOOT=yes]
-
-LINK is the link to one vehicle, in any spelling that paramclient takes. The vehicle must be disarmed. Some
-harmless parameters are changed and put back; READ_ONLY=yes changes none. See docs/testing.md."""
-
 SEARCH_TIMEOUT: Final = 20.0
 """Seconds to wait for the first heartbeat."""
 LISTENING_TIME: Final = 1.2
@@ -71,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the suite; the exit code is 0, 1 when a check failed, 2 when it could not begin."""
     description = (__doc__ or "").partition("\n")[0]
     parser = argparse.ArgumentParser(prog="python -m tests.live", description=description)
-    parser.add_argument("link", nargs="?", help="the link to the vehicle")
+    parser.add_argument("link", help="the link to the vehicle, as in make live LINK=udpin:127.0.0.1:14550")
     parser.add_argument("--kind", choices=["px4", "ardupilot"], help="the autopilot that is expected")
     parser.add_argument("--system", type=int, help="the vehicle's system id, where several are on the link")
     parser.add_argument("--only", default="", metavar="TEXT", help="the checks whose name holds this text")
@@ -79,9 +72,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--second-link", metavar="LINK", help="another link to the same vehicle")
     parser.add_argument("--reboot", action="store_true", help="restart the vehicle too")
     options = parser.parse_args(arguments)
-    if options.link is None:
-        print(HOW_TO_CALL, file=sys.stderr)
-        return 2
     folder = Path(tempfile.mkdtemp(prefix="paramclient-live-"))
     try:
         with Relay(options.link) as relay:
@@ -230,16 +220,7 @@ async def _outcome_of(check: Check, session: Session) -> tuple[str, str]:
     except CheckFailed as failure:
         return FAILED, str(failure)
     except Exception as error:  # whatever it is, the other checks are made and the state is put back
-        return FAILED, "; ".join(f"{type(each).__name__}: {each}" for each in _each_of(error))
-
-
-def _each_of(error: BaseException) -> Iterator[BaseException]:
-    """Give an error, or those in a group."""
-    if isinstance(error, BaseExceptionGroup):
-        for each in error.exceptions:
-            yield from _each_of(each)
-    else:
-        yield error
+        return FAILED, repr(error)  # with those in a group
 
 
 def _tell(line: str) -> None:

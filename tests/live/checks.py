@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import statistics
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -38,13 +36,10 @@ READS: Final = 10
 """Single reads of which the median counts."""
 SEEN_TIMEOUT: Final = 3.0
 """Seconds in which another session has to learn of a change."""
-PARAMETER_FILE: Final = "@PARAM/param.pck"
 RADIO_RATE: Final = 5760.0
 """Bytes per second at 57600 baud."""
 SLOWEST_FETCH: Final = 240.0
 """Seconds after which a fetch over a bad link is given up."""
-KILLED_WITHIN: Final = 20.0
-"""Seconds for another program to open the parameter file and to be killed."""
 NOTICING_TIME: Final = 6.0
 """Seconds after a restart in which it shows, and in which it could show a second time."""
 
@@ -417,44 +412,6 @@ async def restore_before(session: Session) -> str:
         raise CheckFailed(f"{done}: {first(done.shown_rows)}")
     reported = f", left out {', '.join(left_out)}" if left_out else ""
     return f"{done.counts[ApplyStatus.ACCEPTED]} set in {done.elapsed:.2f} s{reported}"
-
-
-@check(
-    "fetch after a program was killed in a transfer",
-    "by list at once, or by file when the session has ended",
-    kinds=("ardupilot",),
-)
-async def fetch_after_kill(session: Session) -> str:
-    context = multiprocessing.get_context("spawn")
-    process = context.Process(target=_open_file_and_die, args=(session.relay.link, session.system))
-    process.start()
-    with anyio.move_on_after(KILLED_WITHIN):
-        while process.is_alive():  # noqa: ASYNC110 - no event reports its end
-            await anyio.sleep(0.02)
-    has_opened = process.exitcode == 0
-    process.kill()
-    process.join()
-    if not has_opened:
-        raise Skip("the vehicle serves no parameter file")
-    return await fetch_cold(session)
-
-
-def _open_file_and_die(link: str, system: int) -> None:
-    """Begin to read the parameter file, and end without closing it. Exit code 0 after its first bytes."""
-
-    def die(received: int, size: int | None) -> None:
-        if received:
-            os._exit(0)
-
-    async def read() -> None:
-        async with ParamClient(link, cache=False, component=192) as client:
-            vehicle = await client.component(system)
-            await vehicle.read_file(PARAMETER_FILE, progress=die)
-
-    try:
-        anyio.run(read)
-    finally:
-        os._exit(1)
 
 
 @check("two sessions, fetch at the same time", "every value right in both")

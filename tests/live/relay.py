@@ -13,10 +13,11 @@ Programs reach the vehicle through a UDP port on loopback. Every program that ha
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -33,7 +34,7 @@ from paramclient.links import create_link, parse_link
 from paramclient.links.link import Peer
 from paramclient.links.sockets import UdpIn
 from paramclient.protocol.ftp import Opcode, Packet
-from paramclient.sim import Air, FaultyLink
+from paramclient.sim import Air
 from paramclient.wire import frames, messages
 
 PROGRAM_TIMEOUT: Final = 5.0
@@ -227,7 +228,7 @@ class Relay:
         self._stop()
 
     def change(self, conditions: Conditions) -> None:
-        """Put other conditions into force. What is on its way at that moment still arrives in its time."""
+        """Put other conditions into force. What is on its way at that moment arrives at once."""
         self._ask(conditions)
 
     def first_request_at(self) -> float | None:
@@ -280,7 +281,6 @@ class _Traffic:
         self._listeners: list[Peer] = [("127.0.0.1", port) for port in listeners]
         self._programs: dict[Peer, float] = {}
         self._arrived: list[bytes] = []
-        self._leaving: list[tuple[FaultyLink, Callable[[bytes], None]]] = []
         self._wake = anyio.Event()
 
     async def run(self, control: Connection) -> None:
@@ -312,8 +312,8 @@ class _Traffic:
         """Put other conditions into force, if any; when a program first requested the table."""
         old, requested_at = self._air, self._vehicle.first_request_at
         if conditions is not None:
-            self._leaving.append((old.uplink, self._vehicle.outgoing.append))
-            self._leaving.append((old.downlink, self._arrived.append))
+            self._vehicle.outgoing += old.uplink.deliver(math.inf)
+            self._arrived += old.downlink.deliver(math.inf)
             self._vehicle.change(conditions)
             self._air = _air_of(self._vehicle, conditions)
             self._wake.set()
@@ -347,7 +347,6 @@ class _Traffic:
             self._wake = anyio.Event()
             now = anyio.current_time()
             self._air.tick(now)
-            self._deliver_leaving(now)
             outgoing, self._vehicle.outgoing[:] = self._vehicle.outgoing[:], []
             for data in outgoing:
                 with suppress(LinkError):  # the reader sees it too, and opens the link again
@@ -358,18 +357,10 @@ class _Traffic:
             for data in arrived:
                 for peer in (*self._listeners, *self._programs):
                     await self._near.send(data, peer)
-            deadlines = [self._air.next_deadline(), *(link.next_deadline() for link, _ in self._leaving)]
-            first = min((each for each in deadlines if each is not None), default=None)
-            sleep = None if first is None else max(first - anyio.current_time(), SHORTEST_SLEEP)
+            due = self._air.next_deadline()
+            sleep = None if due is None else max(due - anyio.current_time(), SHORTEST_SLEEP)
             with anyio.move_on_after(sleep):
                 await self._wake.wait()
-
-    def _deliver_leaving(self, now: float) -> None:
-        """Deliver what was on its way when the conditions changed."""
-        for link, arrive in self._leaving:
-            for data in link.deliver(now):
-                arrive(data)
-        self._leaving = [each for each in self._leaving if each[0].next_deadline() is not None]
 
 
 def _air_of(vehicle: RealVehicle, conditions: Conditions) -> Air:
