@@ -359,7 +359,8 @@ class _Job:
 
         async def announce() -> None:
             await session.check_only()
-            session.announce_write()
+            if not session.options.json:
+                say(f"writing to {session.receiver} on {session.client.link.name}")
 
         self.found = Rows(arrived)
         title, options = f"setting {session.label}", self.options

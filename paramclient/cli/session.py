@@ -169,11 +169,6 @@ class CommandSession:
                 say(f"interrupted: {received}{of} {self.noun}s of {self.label} received and {kept}")
                 raise
 
-    def announce_write(self) -> None:
-        """Print a line on stderr about the vehicle that is written to, unless the subcommand prints JSON."""
-        if not self.options.json:
-            say(f"writing to {self.receiver} on {self.client.link.name}")
-
     async def check_only(self) -> None:
         """Check that the component is still the only one that --vehicle fits.
 

@@ -104,10 +104,9 @@ async def _prepare(
     """
     component, job = session.component, SetJob(session, settle, force)
     if not component.is_extended:
-        named = [
-            f"{name}: {text!r} is not a number" for name, text in texts.items() if number_of(text) is None
-        ]
-        job.described = await known_of_session(session, choice, needed_for=named[0] if named else "")
+        words = [text for text in texts.values() if number_of(text) is None]
+        needed_for = f"{words[0]!r} is not a number" if words else ""
+        job.described = await known_of_session(session, choice, needed_for=needed_for)
     for given, text in texts.items():
         name = spelling(given, component)
         if component.is_extended:
@@ -121,8 +120,7 @@ async def _prepare(
         if isinstance(value, float) and math.isfinite(value) and not value.is_integer():
             kind = await _type_of(session, name)
             if kind is not None and kind.is_integer:
-                what = f"{format_value(value)} is not a whole number, and {name} is an integer"
-                job.doubts.append(f"{name}: {what}")
+                job.doubts.append(f"{name}: {format_value(value)} is not a whole number, as the type needs")
     return job
 
 
@@ -192,15 +190,10 @@ class SetJob:
             AmbiguousVehicle: as from `CommandSession.check_only`; nothing was written.
             NoReply, LinkError: nothing was written.
         """
-        session, is_announced = self.session, False
+        session = self.session
         await session.check_only()
 
         def update(outcome: SetOutcome) -> None:
-            nonlocal is_announced
-            is_wrong = isinstance(outcome.error, UnknownParameter | UsageError)
-            if not (is_announced or is_wrong or outcome.status is SetStatus.NOT_TRIED):
-                is_announced = True
-                session.announce_write()
             self.arrived[outcome.name] = outcome
             status.count(len(self.arrived), len(self.writes))
 
@@ -222,7 +215,7 @@ class SetJob:
         """Return the JSON of the vehicle and the outcomes."""
         results = []
         for each in self.outcomes:
-            known = self.session.component.params.get(each.name) if each.result is None else each.result.param
+            known = self.session.component.params.get(each.name)
             kind = ParamType.REAL32 if known is None else known.type
             results.append(outcome_json(each, kind, info_of(self.described, each.name)))
         return {"vehicle": vehicle_json(self.session.component), "results": results}
