@@ -134,7 +134,7 @@ class _Proof:
         self._content = b"".join(entries)  # behind the header
         self._ends = list(accumulate(map(len, entries)))  # of the first rows, by their number
         self._found: dict[int, int] = {}  # the vehicle's checksum of the first rows, by their number
-        self._asked_at: dict[int, float] = {}  # when it was first requested
+        self._times: dict[int, tuple[float, float]] = {}  # when it was first requested, and answered
         self._changed: dict[int, float] = {}  # by index, when the value was known
         self._refuted: set[tuple[int, int]] = set()  # wrong guesses
         self._round_trip = math.inf  # of the quickest requests
@@ -206,9 +206,8 @@ class _Proof:
         """Forget checksums that may be of other values than the next ones, and return those still needed."""
         needed = {len(self._rows)}.union(*((place.start, place.stop) for place in places))
         since = anyio.current_time() - OUTDATED
-        outdated = {number for number in self._found if self._asked_at[number] < since}
-        for number in outdated:
-            del self._found[number]
+        outdated = {number for number in self._found if self._times[number][0] < since}
+        self._found = {number: found for number, found in self._found.items() if number not in outdated}
         return outdated & needed
 
     @property
@@ -246,10 +245,12 @@ class _Proof:
         """Return the index and the bits of a value that has just moved as it always does, and explains a
         difference alone: hardly anything else explains it, so that it needs no read."""
         moments, now = self._session.table.moments, anyio.current_time()
+        answered = [self._times[number][1] for number in (place.start, place.stop) if number]
+        is_prompt = max(answered) - min(answered) < OUTDATED  # else the place may hold changes of other rows
         for at, bits in self._explanations(place, difference):
             row = self._rows[at]
             passed = now - moments.get(row.name, now)
-            if _has_just_moved(row, bits, passed, is_alone=len(place) == 1):
+            if _has_just_moved(row, bits, passed, is_alone=len(place) == 1, is_prompt=is_prompt):
                 return at, bits
         return None
 
@@ -299,10 +300,10 @@ class _Proof:
         attempts = None if is_proven else attempts_unproven(session.channel)
 
         async def request(number: int) -> None:
-            self._asked_at[number] = anyio.current_time()
+            asked_at = anyio.current_time()
             query = "" if number == len(self._rows) else f"?count={number}"
             answer = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
-            self._found[number] = answer
+            self._found[number], self._times[number] = answer, (asked_at, anyio.current_time())
 
         async with task_group() as tasks:
             for place, number in enumerate(sorted(numbers, reverse=True)):
@@ -370,12 +371,12 @@ class _Proof:
         return True
 
 
-def _has_just_moved(row: PackedParam, bits: int, passed: float, *, is_alone: bool) -> bool:
+def _has_just_moved(row: PackedParam, bits: int, passed: float, *, is_alone: bool, is_prompt: bool) -> bool:
     """Return whether a value has grown by the seconds that have passed; or, where nothing else can have
     changed, by fewer of them, as the vehicle was off meanwhile, or is the same day's pressure."""
     old, new = float(from_bits(row.bits, row.type)), float(from_bits(bits, row.type))
     if SECONDS.fullmatch(row.name) and row.type is ParamType.INT32:
-        fewest = 1 if is_alone and passed <= PASSED_MAX else passed - SECONDS_SLACK
+        fewest = 1 if is_alone and is_prompt and passed <= PASSED_MAX else passed - SECONDS_SLACK
         return new > old and fewest <= new - old <= passed + SECONDS_SLACK
     is_pressure = PRESSURE.fullmatch(row.name) and row.type is ParamType.REAL32
     return bool(is_pressure) and is_alone and 0 < abs(new - old) <= PRESSURE_DRIFT * old

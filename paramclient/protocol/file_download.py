@@ -10,7 +10,6 @@ import anyio
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError, VehicleError
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.ftp import BUSY, FTP_SILENT_TIME, FileCutOff, attempts_unproven, is_free, read_file
-from paramclient.protocol.identity import Identification
 from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import FileUnavailable, Session
@@ -37,7 +36,7 @@ async def download_file(session: Session) -> int:
         raise FileUnavailable("the round trip is too long to find out whether MAVFTP is served")
     if not await is_free(session.channel):
         raise FileUnavailable(BUSY)
-    query, reason, attempts = WITH_DEFAULTS, "", 0
+    vehicle, query, reason, attempts = session.identification, WITH_DEFAULTS, "", 0
     while attempts < DOWNLOADS_MAX:
         requested_at = anyio.current_time()
         try:
@@ -45,7 +44,8 @@ async def download_file(session: Session) -> int:
             pack = decode(data)
         except FileTransferError as error:
             is_missing = error.code == FileErrorCode.FILE_NOT_FOUND
-            if is_missing and query and not _adds_defaults(session.identification):
+            has_defaults = vehicle.is_ardupilot and vehicle.identity.firmware >= ARDUPILOT_WITH_DEFAULTS
+            if is_missing and query and not has_defaults:
                 query = ""
                 continue
             if (is_missing and not session.serves_file) or error.code == FileErrorCode.UNKNOWN_COMMAND:
@@ -67,10 +67,6 @@ async def download_file(session: Session) -> int:
             return pack.total
         attempts += 1
     raise FileUnavailable(f"the parameter file {reason}")
-
-
-def _adds_defaults(identification: Identification) -> bool:
-    return identification.is_ardupilot and identification.identity.firmware >= ARDUPILOT_WITH_DEFAULTS
 
 
 async def _contradiction(session: Session, pack: Pack, count: int | None) -> str:

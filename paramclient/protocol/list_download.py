@@ -53,6 +53,8 @@ FRUITLESS_PASSES_MAX: Final = 5
 QUEUE_TIME: Final = 1.0
 """Seconds without a missing value after which no answer to a read waits behind others in the queue of a slow
 radio: PX4 fills that with its list within a second, at 57600 baud for 6 s, and answers reads behind it."""
+ATTEMPTS_DOUBTFUL: Final = 5
+"""Attempts to read the index 0 or one behind the last, where no list is served: others are answered."""
 GAPS_INTERVAL: Final = 0.02
 """Seconds after which gaps are looked at again without a new value."""
 
@@ -261,17 +263,21 @@ class _Download:
         def copies(attempt: int) -> int:
             return timing.copies if self._is_over() and len(self._missing()) <= channel.window_size else 1
 
+        def attempts_max() -> int:
+            return min(self._attempts_max(), most)
+
         request = dialect.request_read(channel.reads_from, index)
         what = f"index {index} of {channel}"
-        attempts = ATTEMPTS_MAX
+        is_doubtful = not self._is_served and not 0 < index < (self._count or 0)
+        attempts = most = ATTEMPTS_DOUBTFUL if is_doubtful else ATTEMPTS_MAX
         with channel.inbox((dialect.value, index)) as inbox:
             try:
                 await channel.exchange(
-                    request, inbox, accept, what=what, attempts=self._attempts_max, copies=copies
+                    request, inbox, accept, what=what, attempts=attempts_max, copies=copies
                 )
                 self.session.serves_reads[int] = True
             except NoReply as error:
-                attempts = error.attempts
+                attempts = error.attempts if error.attempts < most else ATTEMPTS_MAX
         await self._take_received()
         self._reading.discard(index)
         if index not in self._received:

@@ -77,11 +77,9 @@ async def _read(session: Session, which: str | int) -> ReportedValue:
                         raise
                     control = await _control_read(session, which)
                     if control is None:
-                        answer = None if channel.is_lost else await _read_list(session, inbox, which)
-                        if answer is None:
+                        if channel.is_lost or (listed := await _read_list(session, inbox, which)) is None:
                             raise
-                        session.serves_reads.setdefault(type(which), False)
-                        return answer
+                        return listed
                 if control.param_id == which:
                     return control
                 with suppress(NoReply):  # it answers by now, and may only have been busy
@@ -269,6 +267,8 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
         except ParamClientError as error:
             failures.append(error)
         tasks.cancel_scope.cancel()
+    if not failures:
+        session.serves_reads.setdefault(type(which), False)
     if answers:
         return answers[0]
     if failures and not isinstance(failures[0], NoReply):

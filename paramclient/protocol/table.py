@@ -179,7 +179,7 @@ class Table:
                 return
             new = self.dialect.param(name, raw, number, place, self._encoding)
         elif not is_exact and self._is_reported(old, raw, number):
-            new = self._placed(old, place)
+            new = replace(old, index=place, trust=Trust.LIVE)
         else:
             new = self.dialect.param(name, raw, number, place, self._encoding)
             if new.type == old.type:
@@ -213,7 +213,7 @@ class Table:
 
     def end_list(self) -> None:
         """Take note that a list has ended, and that its first and last index are certain."""
-        self.begins_at_1 = 0 not in self.names
+        self.begins_at_1 = 0 not in self.names and (self.is_growing or self.count in self.names)
         if self.is_growing and self.names:
             self.count = max(self.names) + (0 in self.names)
 
@@ -317,11 +317,6 @@ class Table:
         self.unconfirm()
         if was_complete:
             self.recounted()
-
-    def _placed(self, param: Param, place: int | None) -> Param:
-        if param.index == place and param.trust is Trust.LIVE:
-            return param
-        return replace(param, index=place, trust=Trust.LIVE)
 
     def _is_reported(self, known: Param, raw: bytes, number: int) -> bool:
         """Return whether these bytes are the component's form of a known value, which may be rounded."""

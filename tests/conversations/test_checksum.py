@@ -154,6 +154,42 @@ async def test_pressure_that_moves_between_two_requests_costs_one_round_trip(aft
 
 
 @virtual
+async def test_a_set_between_an_answer_and_a_repeated_one_is_not_taken_for_run_time() -> None:
+    """By the checksums before and behind STAT_RUNTIME, it would be 17,204 s, and nothing else changed."""
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    cached = vehicle.params
+    place = [param.name for param in vehicle.listed].index("STAT_RUNTIME")
+    lost = {"", f"?count={place + 1}"}
+    requests: dict[int, str] = {}
+
+    def up(message: Message) -> bool:
+        if isinstance(message, FileTransfer):
+            packet = Packet.unpack(message.payload)
+            query = packet.data.decode().partition("param.pck")[2]
+            if query and query in requests.values():  # it was lost
+                vehicle.load({"PLDP_SPEED_DN": -6.6})
+            requests[packet.sequence + 1] = query
+        return True
+
+    def down(message: Message) -> bool:
+        if not isinstance(message, FileTransfer) or len(requests) <= 2:
+            return True
+        query = requests[Packet.unpack(message.payload).sequence]
+        is_lost = query in lost
+        lost.discard(query)
+        return not is_lost
+
+    async with converse(Air.symmetric([Tap(vehicle, up=up, down=down)], delay=0.05)) as conversation:
+        moments = dict.fromkeys(cached, -80_000.0)
+        node = await with_cached_table(conversation, cached, moments=moments, volatile={"STAT_RUNTIME"})
+        vehicle.load({"STAT_BOOTCNT": 1 + int(cached["STAT_BOOTCNT"].value), "STAT_RUNTIME": 100})
+        result = await fetch_all(node.plain)
+        assert not lost
+        assert "PLDP_SPEED_DN" in result.changed
+        check(vehicle, node, result)
+
+
+@virtual
 async def test_values_that_move_are_read_by_their_checksum_and_learnt() -> None:
     vehicle = ArduPilotVehicle()
     async with converse(vehicle) as conversation:

@@ -148,10 +148,21 @@ async def test_a_count_that_is_too_large_costs_seconds_and_no_value(count: int) 
         assert len(conversation.sent) < 1_000
 
 
-@pytest.mark.parametrize("serves", [EVERYTHING, ("names", "sets")])
-async def test_names_in_lower_case_are_found_whatever_the_autopilot(serves: tuple[str, ...]) -> None:
+async def test_the_first_value_of_a_list_that_is_lost_is_missing_and_no_other() -> None:
+    vehicle = Tap(Partial(serves=("list",)), down=lambda message: getattr(message, "param_index", None) != 0)
+    async with talking(vehicle) as (_, session):
+        result = await fetch_all(session)
+        assert (result.missing, result.received) == ((0,), len(TABLE) - 1)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("serves", [EVERYTHING, ("names", "sets"), ("indices", "sets")])
+async def test_names_in_lower_case_are_found_whatever_the_autopilot(
+    serves: tuple[str, ...], first: int
+) -> None:
     table = {"gain": (0.5, ParamType.REAL32), "mode": (5, ParamType.REAL32)}
-    async with talking(Partial(table, serves=serves, heartbeat=ARDUPILOT)) as (_, session):
+    vehicle = Partial(table, serves=serves, first=first, heartbeat=ARDUPILOT)
+    async with talking(Air.symmetric([vehicle], delay=0.05)) as (_, session):
         result = await write(session, "mode", 4)
         assert (result.name, result.actual) == ("mode", 4)
         assert anyio.current_time() < 15.0
