@@ -18,7 +18,7 @@ from paramclient.model.identity import Identity
 from paramclient.model.values import Param, Value, bits_of
 from paramclient.sim import GenericVehicle
 from tests.caches import NOW, PX4, update
-from tests.commands import Command, in_process
+from tests.commands import Command
 
 INT32, REAL32 = ParamType.INT32, ParamType.REAL32
 AT = "2026-11-18T11:06:40.000Z"
@@ -29,12 +29,6 @@ THIRD = replace(PX4, system=3, uid="cc00000000000003")
 
 Write: TypeAlias = Callable[..., str]
 Content = dict[str, tuple[Value, int] | tuple[Value, int, Value]]
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], cache: Path) -> Command:
-    """Run the command line in this process, with a new cache."""
-    return in_process(capsys, "--cache", str(cache))
 
 
 def keep(cache: Path, content: Content, identity: Identity = FIRST, *, component: int = 1) -> None:

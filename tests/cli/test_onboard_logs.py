@@ -7,16 +7,11 @@ from pathlib import Path
 import pytest
 
 from paramclient import read_file
-from tests.commands import Command, in_process
+from tests.commands import Command
 
 DATA = Path(__file__).parents[1] / "data"
 LOGS = {"ardupilot_flight.bin": (1382, 41), "px4_flight.ulg": (850, 49)}
 """Parameters of each log, and those that differ from their default."""
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], cache: Path) -> Command:
-    return in_process(capsys, "--cache", str(cache))
 
 
 @pytest.mark.parametrize("name", LOGS)

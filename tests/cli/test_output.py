@@ -75,7 +75,8 @@ def in_zone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_times_are_local_with_their_zone_and_can_be_parsed_back(command: Command, put: Put) -> None:
     at = 1_795_000_000.125
     assert local_time(at) == "2026-11-18T16:36:40.125+05:30"
-    assert parse_time(local_time(at), at + 1) == at
+    assert parse_time(local_time(at), at + 1) == parse_time("2026-11-18 16:36:40.125", at + 1) == at
+    assert parse_time("yesterday 16:36:40.125", at + 86400) == at
     vehicle = PX4Vehicle(table={"A": 1, "B": 2})
     assert command("fetch", put(vehicle)).code == 0
     assert command("set", put(vehicle), "A", 3).code == 0

@@ -15,11 +15,10 @@ import pytest
 
 from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint
-from paramclient.wire import messages
 from tests.cable import TIMEOUT
+from tests.links.test_links import HEARTBEAT, udp_socket
 from tests.shell import a_client, bits, generic
 
-HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
 GONE = [errno.ENETDOWN, errno.ENETUNREACH, errno.EADDRNOTAVAIL, errno.EINVAL]
 
 
@@ -43,13 +42,6 @@ def errors(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[int]]:
     return errors
 
 
-def listening(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sock.bind((host, port))
-    sock.settimeout(TIMEOUT)
-    return sock
-
-
 async def failure(link: Link) -> LinkError:
     with anyio.fail_after(TIMEOUT), pytest.raises(LinkError) as caught:  # noqa: PT012 - received data precedes it
         while True:
@@ -62,7 +54,7 @@ async def failure(link: Link) -> LinkError:
 async def test_a_short_network_outage_loses_only_sent_datagrams(
     errors: dict[str, list[int]], reason: int
 ) -> None:
-    with listening() as vehicle:
+    with udp_socket() as vehicle:
         link: Any = create_link(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}")
         await link.open()
         errors["sendto"].append(reason)
@@ -76,7 +68,7 @@ async def test_a_short_network_outage_loses_only_sent_datagrams(
 @pytest.mark.asyncio
 async def test_a_failed_socket_is_reopened(kind: str, errors: dict[str, list[int]]) -> None:
     """For every error of the operating system; delayed errors of earlier datagrams are skipped."""
-    with listening() as far:
+    with udp_socket() as far:
         port = far.getsockname()[1]
         link: Any = create_link("udpin:127.0.0.1:0" if kind == "udpin" else f"udpout:127.0.0.1:{port}")
         assert link.reconnects

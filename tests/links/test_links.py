@@ -300,9 +300,11 @@ async def test_bytes_in_both_directions(kind: str) -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", KINDS)
-async def test_closing_wakes_the_receiver(kind: str) -> None:
+async def test_closing_wakes_the_receiver_and_frees_the_port(kind: str) -> None:
+    files = open_files()
     async with connected(kind) as (link, _), anyio.create_task_group() as tasks:
         failures: list[LinkError] = []
+        address: Any = getattr(link, "address", None)
 
         async def receive() -> None:
             with pytest.raises(LinkError) as caught:
@@ -321,16 +323,6 @@ async def test_closing_wakes_the_receiver(kind: str) -> None:
         for call in (link.receive(), link.send(HEARTBEAT, None)):
             with pytest.raises(LinkError, match="not open"):
                 await call
-
-
-@pytest.mark.asyncio
-@pytest.mark.parametrize("kind", KINDS)
-async def test_closing_leaves_no_descriptor(kind: str) -> None:
-    await anyio.lowlevel.checkpoint()
-    files = open_files()
-    async with connected(kind) as (link, _):
-        address: Any = getattr(link, "address", None)
-        await link.close()
         if kind in ("udpin", "tcpin"):
             async with opened(f"{kind}:127.0.0.1:{address[1]}") as again:
                 assert again.address == address

@@ -286,10 +286,3 @@ def test_empty_ranges_and_invalid_values_are_left_out() -> None:
     text = '<paramfile><param name="A"><field name="Range">2 1</field></param></paramfile>'
     info = read_content(text.encode(), source="the file")["A"]
     assert (info.minimum, info.maximum) == (None, None)
-
-
-def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match=r"none\.json: cannot be read: No such file"):
-        read_metadata(tmp_path / "none.json")
-    with pytest.raises(FileError, match="cannot be read: not a regular file"):
-        read_metadata(tmp_path)
