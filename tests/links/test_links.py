@@ -1,4 +1,4 @@
-"""Links: names, sockets on loopback, simulated vehicles in the process."""
+"""Links: sockets on loopback, simulated vehicles in the process."""
 
 from __future__ import annotations
 
@@ -17,15 +17,13 @@ from typing import Any
 import anyio
 import anyio.lowlevel
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from paramclient.errors import LinkError, UsageError
-from paramclient.links import FORMS, Link, Peer, SimLink, create_link, link, parse_link, sockets
-from paramclient.sim import PX4Vehicle
+from paramclient.errors import LinkError
+from paramclient.links import Link, Peer, create_link, link, sockets
 from paramclient.wire import messages
 from tests.cable import Cable
 
+pytestmark = pytest.mark.asyncio
 HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
 TIMEOUT = 20.0
 """Seconds after which a test fails; a passing test never waits that long."""
@@ -144,144 +142,9 @@ def stream_of(far: Any, size: int) -> bytes:
 KINDS = ["udpin", "udpout", "tcp", "tcpin", "serial"]
 
 
-# Names
-
-
-@pytest.mark.parametrize(
-    ("text", "name"),
-    [
-        ("udpin:0.0.0.0:14550", "udpin:0.0.0.0:14550"),
-        ("udp://127.0.0.1:14550", "udpin:127.0.0.1:14550"),
-        ("udpin:14550", "udpin:0.0.0.0:14550"),
-        ("localhost:14550", "udpin:localhost:14550"),
-        ("[::1]:14550", "udpin:[::1]:14550"),
-        ("udpin:[0:0:0:0:0:0:0:1]:00080", "udpin:[::1]:80"),
-        ("udpin:[fe80::1%eth0]:14550", "udpin:[fe80::1%eth0]:14550"),
-        ("UDPIN:LocalHost:14550", "udpin:localhost:14550"),
-        (" udpin:0.0.0.0:14550\n", "udpin:0.0.0.0:14550"),
-        ("udpout://vehicle_7.local:14550", "udpout:vehicle_7.local:14550"),
-        ("tcp:127.0.0.1:5760", "tcp:127.0.0.1:5760"),
-        ("tcp:[::1]:5760", "tcp:[::1]:5760"),
-        ("tcpin:5760", "tcpin:0.0.0.0:5760"),
-        ("serial:/dev/ttyACM0", "serial:/dev/ttyACM0:57600"),
-        ("/dev/ttyACM0,115200", "serial:/dev/ttyACM0:115200"),
-        ("com5:115200", "serial:COM5:115200"),
-        ("serial:///dev/ttyUSB0,9600", "serial:/dev/ttyUSB0:9600"),
-        (
-            "serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0-port0:115200",
-            "serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0-port0:115200",
-        ),
-        ("replay:///logs/a b.tlog", "replay:/logs/a b.tlog"),
-        ("replay:what?.tlog", "replay:what?.tlog"),
-        ("REPLAY:/x.tlog?speed=2", "replay:/x.tlog?speed=2"),
-        ("replay:/x.tlog?speed=inf", "replay:/x.tlog?speed=0.0"),
-        ("sim://ArduPilot", "sim:ardupilot"),
-        ("sim:px4?metadata=1", "sim:px4?metadata=1"),
-        ("sim:px4?seed=1&loss=.05&delay=0.05", "sim:px4?delay=0.05&loss=0.05&seed=1"),
-        ("sim:px4?jitter=-0&rate=1e3&queue=0", "sim:px4?jitter=0.0&queue=0&rate=1000.0"),
-        (
-            "sim:ardupilot?duplicate=1&reorder=0.5&bit_errors=1e-05&system=255&param_error=1",
-            "sim:ardupilot?bit_errors=1e-05&duplicate=1&param_error=1&reorder=0.5&system=255",
-        ),
-    ],
-)
-def test_every_spelling_has_one_canonical_name(text: str, name: str) -> None:
-    spec = parse_link(text)
-    assert str(spec) == spec.name == name
-    assert parse_link(name) == spec
-
-
-NO_HOST_AND_PORT = ["", "0.0.0.0", "0.0.0.0:", "a:65536", "a:-1", "a:+5", "a:١٢", "٣", "::1:1", "a:1/"]
-NO_HOSTS = [
-    *("[::g]", "[127.0.0.1]", "256.0.0.1", "10.1", "-x", "a..b", "me@host"),
-    *("a" * 64, f"{'a.' * 127}a"),
-]
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("", "kind of link is missing"),
-        ("/home/me/vehicle.params", "kind of link is missing"),
-        ("./px4:1", "kind of link is missing"),
-        ("http://127.0.0.1:80", "this is an HTTP address, not a link"),
-        ("mavlink:px4", "'mavlink' is not a kind of link"),
-        *((f"udpin:{rest}", "expected HOST:PORT") for rest in NO_HOST_AND_PORT),
-        *((f"{kind}14550", "expected HOST:PORT") for kind in ("udpout:", "udpout::", "tcp:", "tcp://:")),
-        ("udpout:10.0.0.1:0", "expected HOST:PORT"),
-        *((f"udpout:{host}:14550", "is not a host name or an address") for host in NO_HOSTS),
-        ("serial:ttyACM0:57600", "a device and a baud rate"),
-        ("serial:/dev/tty ACM0", "a device and a baud rate"),
-        ("/dev/ttyACM0:0", "from 300 to 20000000"),
-        ("/dev/ttyUSB0,57", "from 300 .* not 57"),
-        ("sim:", "px4, ardupilot and camera"),
-        ("sim:px4?loss", "NAME=VALUE"),
-        ("sim:px4?colour=red", "'colour' is not an option"),
-        ("sim:px4?loss=0.1&loss=0.2", "given twice"),
-        ("sim:px4?loss=", "a number, not ''"),
-        ("sim:px4?param_error=yes", "a number, not 'yes'"),
-    ],
-)
-def test_an_invalid_name_gives_the_problem_and_the_accepted_forms(text: str, problem: str) -> None:
-    with pytest.raises(UsageError, match=problem) as caught:
-        parse_link(text)
-    assert FORMS in str(caught.value)
-
-
-SCHEMES = "udp udpin udpout tcp tcpin tcpout serial sim http"
-MARKS = ": : : // / ? & = [ ] , % . -"
-WORDS = (
-    "px4 ardupilot [::1] 127.0.0.1 localhost 14550 0 99999 /dev/ttyACM0 COM3 loss seed queue rate 0.5 1e400 é"
-)
-PIECES = st.sampled_from(f"{SCHEMES} {MARKS} {WORDS}".split())
-
-
-@given(st.text() | st.lists(PIECES, max_size=10).map("".join))
-def test_any_text_is_a_link_or_a_usage_error(text: str) -> None:
-    try:
-        spec = parse_link(text)
-    except UsageError:
-        return
-    assert parse_link(spec.name) == spec
-    assert parse_link(spec.name).name == spec.name
-
-
-# Making links
-
-
-@pytest.mark.parametrize(
-    ("options", "problem"),
-    [
-        ("px4?loss=1.1", "loss must be 0 to 1, not 1.1"),
-        ("px4?delay=-1", "delay must be 0 or more"),
-        ("px4?loss_burst=0.5", "loss_burst must be 1 or more"),
-        ("px4?rate=100&queue=-1", "queue must be 0 or more"),
-        ("px4?rate=0", "rate must be a number of bytes per second above 0"),
-        ("px4?queue=100", "queue needs a rate"),
-        ("px4?system=0", "system must be 1 to 255"),
-        ("ardupilot?metadata=1", "option metadata is for sim:px4"),
-    ],
-)
-def test_an_option_out_of_its_range_is_a_usage_error(options: str, problem: str) -> None:
-    with pytest.raises(UsageError, match=problem):
-        create_link(f"sim:{options}")
-
-
-def test_create_link_returns_links_unchanged() -> None:
-    link = SimLink(PX4Vehicle(), "sim:mine")
-    assert create_link(link) is link
-    assert isinstance(create_link(parse_link("udpin:14550")), Link)
-    wrapped = create_link(PX4Vehicle())
-    assert isinstance(wrapped, SimLink)
-    assert wrapped.name == "sim:custom"
-    with pytest.raises(UsageError, match="not as object"):
-        create_link(object())  # type: ignore[arg-type]  # invalid on purpose
-
-
 # All kinds of links
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("kind", KINDS)
 async def test_bytes_in_both_directions(kind: str) -> None:
     async with connected(kind) as (link, far):
@@ -298,7 +161,6 @@ async def test_bytes_in_both_directions(kind: str) -> None:
         assert repr(link).endswith("open>")
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("kind", KINDS)
 async def test_closing_wakes_the_receiver_and_frees_the_port(kind: str) -> None:
     files = open_files()
@@ -329,7 +191,6 @@ async def test_closing_wakes_the_receiver_and_frees_the_port(kind: str) -> None:
     assert open_files() == files
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_cancelled_receive_loses_nothing(kind: str) -> None:
     steps = 6
@@ -360,7 +221,6 @@ async def test_a_cancelled_receive_loses_nothing(kind: str) -> None:
 # UDP
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("host", LOOPBACKS)
 async def test_udpin_and_udpout_communicate(host: str) -> None:
     shown = f"[{host}]" if ":" in host else host
@@ -383,7 +243,6 @@ async def test_udpin_and_udpout_communicate(host: str) -> None:
         assert await collect(station, 1) == [(peer, frame(2))]
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "udpout", "tcp", "tcpin"])
 async def test_an_unknown_host_is_a_link_error(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     async def getaddrinfo(*_: object, **__: object) -> None:
@@ -395,7 +254,6 @@ async def test_an_unknown_host_is_a_link_error(kind: str, monkeypatch: pytest.Mo
     assert isinstance(caught.value.__cause__, socket.gaierror)
 
 
-@pytest.mark.asyncio
 async def test_udpin_sends_to_every_known_vehicle() -> None:
     async with opened("udpin:127.0.0.1:0") as link:
         await link.send(HEARTBEAT, None)
@@ -424,7 +282,6 @@ async def test_udpin_sends_to_every_known_vehicle() -> None:
                     sock.recv(1000)
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 async def test_a_port_in_use_is_a_link_error_until_it_is_free(kind: str) -> None:
     async with opened(f"{kind}:127.0.0.1:0") as first:
@@ -443,7 +300,6 @@ async def test_a_port_in_use_is_a_link_error_until_it_is_free(kind: str) -> None
         await second.close()
 
 
-@pytest.mark.asyncio
 async def test_udpout_receives_only_from_its_target_and_keeps_its_port() -> None:
     with udp_socket() as vehicle:
         async with opened(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}") as link:
@@ -461,7 +317,6 @@ async def test_udpout_receives_only_from_its_target_and_keeps_its_port() -> None
                 assert vehicle.recvfrom(1000) == (frame(5), address)
 
 
-@pytest.mark.asyncio
 async def test_udpout_may_start_before_its_vehicle() -> None:
     port = free_udp_port()
     async with opened(f"udpout:127.0.0.1:{port}") as link:
@@ -475,7 +330,6 @@ async def test_udpout_may_start_before_its_vehicle() -> None:
             assert [data for _, data in await collect(link, 1)] == [frame(3)]
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])
 async def test_a_burst_waits_for_a_late_reader(kind: str) -> None:
     count = 2000
@@ -502,7 +356,6 @@ async def test_a_burst_waits_for_a_late_reader(kind: str) -> None:
     assert got[:expected] == [frame(number) for number in range(expected)]
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -523,7 +376,6 @@ async def test_an_unreachable_address_is_a_link_error(name: str, text: str) -> N
 # TCP
 
 
-@pytest.mark.asyncio
 async def test_tcp_opens_after_a_refused_connection() -> None:
     with tcp_listener() as listener:
         port = listener.getsockname()[1]
@@ -549,7 +401,6 @@ def deaf_listener() -> Iterator[int]:
         yield listener.getsockname()[1]
 
 
-@pytest.mark.asyncio
 async def test_tcp_connecting_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link, "OPEN_TIMEOUT", 0.05)
     with deaf_listener() as port:
@@ -559,7 +410,6 @@ async def test_tcp_connecting_times_out(monkeypatch: pytest.MonkeyPatch) -> None
         assert open_files() == files
 
 
-@pytest.mark.asyncio
 async def test_closing_ends_an_open_in_progress() -> None:
     failures: list[str] = []
 
@@ -580,7 +430,6 @@ async def test_closing_ends_an_open_in_progress() -> None:
     assert ["closed" in failure for failure in failures] == [True]
 
 
-@pytest.mark.asyncio
 async def test_each_address_of_a_name_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     async def getaddrinfo(host: str, port: int, **_: object) -> list[Any]:
         return [(socket.AF_INET, 0, 0, "", (each, port)) for each in ("127.0.0.9", "127.0.0.1")]
@@ -594,7 +443,6 @@ async def test_each_address_of_a_name_is_tried(monkeypatch: pytest.MonkeyPatch) 
                 assert [data for _, data in await collect(link, 1)] == [frame(1)]
 
 
-@pytest.mark.asyncio
 async def test_a_dropped_tcp_connection_can_be_reopened() -> None:
     with tcp_listener() as listener:
         async with opened(f"tcp:127.0.0.1:{listener.getsockname()[1]}") as link:
@@ -622,7 +470,6 @@ def reset(sock: socket.socket) -> None:
     sock.close()
 
 
-@pytest.mark.asyncio
 async def test_tcp_drops_a_peer_that_does_not_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -641,7 +488,6 @@ async def test_tcp_drops_a_peer_that_does_not_read(
             await link.send(bytes(50_000_000), None)
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("leave", [socket.socket.close, reset])
 @pytest.mark.parametrize("selector", [selectors.DefaultSelector, selectors.SelectSelector])
 async def test_tcpin_continues_when_a_client_disconnects(
@@ -673,7 +519,6 @@ async def test_tcpin_continues_when_a_client_disconnects(
                 assert peer not in peer_of.values()
 
 
-@pytest.mark.asyncio
 async def test_tcpin_limits_its_connections(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sockets, "CONNECTIONS_MAX", 1)
     async with connected("tcpin") as (link, far):
@@ -693,7 +538,6 @@ async def test_tcpin_limits_its_connections(monkeypatch: pytest.MonkeyPatch) -> 
 # Simulated vehicles
 
 
-@pytest.mark.asyncio
 async def test_a_sim_link_has_the_faults_of_its_name() -> None:
     async with opened("sim:px4?loss=1&delay=0.03&seed=4&param_error=1") as link:
         for _ in range(5):

@@ -7,7 +7,6 @@ import errno
 import fcntl
 import os
 import struct
-import sys
 import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -27,6 +26,7 @@ from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
 from tests.shell import a_client, bits, generic, until
 
+pytestmark = pytest.mark.asyncio
 HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
 RATE = 40_000.0
 """Bytes per second in each direction. With 57600 baud (5,760 bytes per second), tests would take seconds."""
@@ -69,7 +69,6 @@ async def refusal(link: Link) -> LinkError:
 # Complete sessions
 
 
-@pytest.mark.asyncio
 async def test_unplugged_in_the_middle_of_a_download(
     cable: Cable, port: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -103,7 +102,6 @@ async def test_unplugged_in_the_middle_of_a_download(
 # The link
 
 
-@pytest.mark.asyncio
 async def test_a_stalled_device_is_lost_and_its_data_dropped(
     cable: Cable, port: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -140,7 +138,6 @@ async def test_a_stalled_device_is_lost_and_its_data_dropped(
 # Ports that cannot be opened
 
 
-@pytest.mark.asyncio
 async def test_an_open_port_is_exclusive_and_closing_frees_it(cable: Cable) -> None:
     def is_exclusive() -> bool:
         try:
@@ -164,7 +161,6 @@ async def test_an_open_port_is_exclusive_and_closing_frees_it(cable: Cable) -> N
         pass
 
 
-@pytest.mark.asyncio
 @pytest.mark.parametrize("name", ["", "file", "missing"])
 async def test_files_that_are_not_ports(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
@@ -173,7 +169,6 @@ async def test_files_that_are_not_ports(tmp_path: Path, name: str) -> None:
     assert expected in str(await refusal(create_link(f"serial:{path}")))
 
 
-@pytest.mark.asyncio
 async def test_an_unsupported_baud_rate(cable: Cable, port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise serialx.UnsupportedSetting("Unsupported baudrate")
@@ -183,7 +178,6 @@ async def test_an_unsupported_baud_rate(cable: Cable, port: str, monkeypatch: py
         await create_link(cable.link).open()
 
 
-@pytest.mark.asyncio
 async def test_opening_a_stalled_driver_times_out(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
     """A port that opens later is closed again."""
     monkeypatch.setattr(link, "OPEN_TIMEOUT", 0.05)
@@ -203,13 +197,3 @@ async def test_opening_a_stalled_driver_times_out(cable: Cable, monkeypatch: pyt
     assert f"{cable.device} did not open within " in str(await refusal(create_link(cable.link)))
     may_go_on.set()
     assert await anyio.to_thread.run_sync(is_closed.wait, TIMEOUT)
-
-
-# The extra
-
-
-def test_without_the_extra_the_error_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "serialx", None)
-    with pytest.raises(UsageError) as caught:
-        create_link("/dev/ttyACM0")
-    assert str(caught.value) == "serial:/dev/ttyACM0:57600 needs serialx: pip install 'paramclient[serial]'"
