@@ -8,7 +8,7 @@ import logging
 import signal
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import partial, reduce
 from types import FrameType
 from typing import Final
 
@@ -41,7 +41,10 @@ def run(arguments: Sequence[str]) -> int:
             call = partial(command, *words, **bound.kwargs)
             code = anyio.run(_until_signal, call) if inspect.iscoroutinefunction(command) else call()
         except CycloptsError as error:
-            report(_usage_text(error))
+            usage = None
+            if isinstance(error, MissingArgumentError):
+                usage = dict(subcommands())[" ".join(error.command_chain or ())].usage
+            report(f"{error} {usage or ''}".rstrip())
             return ExitCode.USAGE
         except ParamClientError as error:
             report(text_of(error, takes_all=arguments[0] != "signing"))
@@ -56,21 +59,9 @@ def run(arguments: Sequence[str]) -> int:
     return code or ExitCode.DONE
 
 
-def _usage_text(error: CycloptsError) -> str:
-    """Return an error of the arguments as one line, with the usage if an argument is missing."""
-    if not isinstance(error, MissingArgumentError):
-        return str(error)
-    app = _app
-    for word in error.command_chain or ():
-        app = app[word]
-    return f"{error} {app.usage or ''}".rstrip()
-
-
 def subcommands(*words: str) -> Iterator[tuple[str, App]]:
     """Yield each subcommand with its name, such as `cache list`."""
-    app = _app
-    for word in words:
-        app = app[word]
+    app = reduce(App.__getitem__, words, _app)
     names = [name for name in app if not name.startswith("-")]
     if not names:
         yield " ".join(words), app
@@ -79,23 +70,24 @@ def subcommands(*words: str) -> Iterator[tuple[str, App]]:
 
 
 @contextmanager
-def on_end_signal(end: Callable[[int], object]) -> Iterator[None]:
+def on_end_signal(end: Callable[[], object]) -> Iterator[list[int]]:
     """Call `end` in the event loop on SIGINT or SIGTERM. A second signal ends the process immediately.
 
-    Args:
-        end: takes the signal number.
+    Yields:
+        the number of the signal, after it.
     """
-    loop = asyncio.get_running_loop()
+    loop, received = asyncio.get_running_loop(), list[int]()
 
     def receive(number: int, _: FrameType | None) -> None:
+        received.append(number)
         for each in _SIGNALS:
             signal.signal(each, signal.SIG_DFL)
-        loop.call_soon_threadsafe(end, number)
+        loop.call_soon_threadsafe(end)
 
     # not by the event loop, which has no signal handlers on Windows
     before = [(number, signal.signal(number, receive)) for number in _SIGNALS]
     try:
-        yield
+        yield received
     finally:
         for each in before:
             signal.signal(*each)
@@ -103,15 +95,8 @@ def on_end_signal(end: Callable[[int], object]) -> Iterator[None]:
 
 async def _until_signal(work: Callable[[], Awaitable[int | None]]) -> int | None:
     """Await `work` and return its exit code; on a signal, cancel it and return 128 plus the signal number."""
-    received: list[int] = []
-    with anyio.CancelScope() as scope:
-
-        def end(number: int) -> None:
-            received.append(number)
-            scope.cancel()
-
-        with on_end_signal(end):
-            return await work()
+    with anyio.CancelScope() as scope, on_end_signal(scope.cancel) as received:
+        return await work()
     return 128 + received[0]
 
 

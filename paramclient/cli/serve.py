@@ -77,7 +77,7 @@ async def serve(
             print_line(f"ground stations: {endpoint.address}")
         print_line(f"serving on {url}")
 
-    with on_end_signal(lambda _: stop.set()):
+    with on_end_signal(stop.set):
         await service.serve(
             hub,
             listen,
