@@ -102,7 +102,7 @@ async def _stored(session: CommandSession, *, added_only: bool = False) -> Metad
     With `added_only`, metadata that a vehicle has provided is left out: the firmware may have been built from
     other sources since, and only the vehicle can confirm it.
     """
-    if session.options.place is False:
+    if session.options.no_cache:
         return None
     cache = session.client.cache or ParamCache(session.options.cache)
     store, component = MetadataStore.beside(cache.path), session.component
@@ -117,7 +117,7 @@ def known_of_sets(
     sets: Sequence[ParamSet], options: CacheOptions | LinkOptions, given: Metadata | None
 ) -> list[Metadata | None]:
     """Return the given metadata, else what is stored for the firmware of each set, or of another set."""
-    if given is not None or options.place is False:
+    if given is not None or options.no_cache:
         return [given] * len(sets)
     return MetadataStore.beside(ParamCache(options.cache).path).known_of_sets(sets)
 
@@ -206,5 +206,4 @@ def _added_json(added: AddedMetadata, metadata: Metadata) -> JsonObject:
 
 def _files(options: CacheOptions) -> AddedFiles:
     """Return the added files beside the cache that the options name."""
-    with ParamCache(options.cache) as cache:
-        return MetadataStore.beside(cache.path).added
+    return MetadataStore.beside(ParamCache(options.cache).path).added

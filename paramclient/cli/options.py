@@ -8,7 +8,7 @@ subclass.
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final, TypeAlias
+from typing import Annotated, ClassVar, Final, TypeAlias
 
 from cyclopts import Group, Parameter
 from cyclopts.validators import Number, mutually_exclusive
@@ -49,10 +49,8 @@ class CacheOptions:
     cache: str | None = None
     """The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache."""
 
-    @property
-    def place(self) -> str | None:
-        """The cache argument of `ParamCache`."""
-        return self.cache
+    no_cache: ClassVar[bool] = False
+    """As in `LinkOptions`."""
 
 
 @Parameter(name="*")

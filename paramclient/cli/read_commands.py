@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import anyio
 
 from paramclient.cli.json_output import JsonObject, fetch_json, info_of, param_json, param_value, taken
-from paramclient.cli.metadata import (
-    MetadataChoice,
-    default_in,
-    known_of_session,
-    no_defaults,
-    say_sources,
-)
+from paramclient.cli.metadata import MetadataChoice, default_in, known_of_session, no_defaults, say_sources
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     ExitCode,
@@ -37,8 +31,7 @@ from paramclient.errors import ParamClientError, VehicleError
 from paramclient.links import ReplayLink
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import hash_text, rounded, time_text
-from paramclient.model.paramset import Default
-from paramclient.model.values import Param
+from paramclient.model.paramset import Default, ParamMap
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.table import Change
@@ -76,7 +69,8 @@ async def fetch(
                 raise VehicleError(no_defaults(), *session.component.address)
             kept = chosen.choose({param.name for param in params}) if names else {*result.params}
             if changed:
-                kept &= {param.name for param in params if _is_changed(param, defaults[param.name])}
+                given = {name: default.value for name, default in defaults.items() if default}
+                kept &= ParamMap(result.params).changed(given).keys()
             params = [param for param in params if param.name in kept]
             columns = ("name", "value", "type", "index", "trust", *(["default"] if changed else []))
             item = fetch_json(session.component, result, params, known)
@@ -109,22 +103,14 @@ async def get(
         async def work(session: CommandSession) -> _Shown:
             params, errors = await get_chosen(session, chosen)
             known = await known_of_session(session, metadata)
-            item: JsonObject = {
-                "params": {
-                    each.name: param_json(each, info_of(known, each.name), whole=True) for each in params
-                }
-            }
-            if errors:
-                item["errors"] = {name: str(error) for name, error in errors.items()}
+            read = {each.name: param_json(each, info_of(known, each.name), whole=True) for each in params}
+            failed = {name: str(error) for name, error in errors.items()}
+            item: JsonObject = {"params": read} | ({"errors": failed} if failed else {})
             columns = ("name", "value", "type", "index", "meaning", "units")
             return _Shown(item, columns, partial(_report_get, session, errors.values()))
 
         done = await found.work(work)
     return found.show(done)
-
-
-def _is_changed(param: Param, default: Default | None) -> bool:
-    return default is not None and replace(param, default=default.value).is_changed is True
 
 
 @dataclass(frozen=True, slots=True)

@@ -102,8 +102,6 @@ class ChosenVehicle:
         if found["all"] and one:
             raise UsageError(f"--vehicle all is not possible here: {one}; name one vehicle")
         system, component = (int(found[name]) if found[name] else None for name in ("system", "component"))
-        if system == 0 or max(system or 0, component or 0) > 255:
-            raise UsageError(f"--vehicle {text}: system ids are 1 to 255, component ids 0 to 255")
         return cls(system, component, found["uid"] and found["uid"].lower(), bool(found["all"]))
 
 

@@ -6,14 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.cached import load_tables, show_summaries
-from paramclient.cli.json_output import (
-    info_json,
-    info_of,
-    param_value,
-    set_json,
-    table_param_json,
-    taken,
-)
+from paramclient.cli.json_output import info_json, info_of, param_value, set_json, table_param_json, taken
 from paramclient.cli.metadata import (
     METADATA_HINT,
     MetadataFile,
