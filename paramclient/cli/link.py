@@ -11,7 +11,7 @@ import anyio
 
 from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import Seconds, TrafficOptions
-from paramclient.cli.output import clear_screen, milliseconds, print_json, print_line, print_table, show
+from paramclient.cli.output import milliseconds, print_json, print_line, print_table, show
 from paramclient.cli.session import Deadline, listen, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
@@ -65,7 +65,7 @@ async def link(
             report = client.traffic_report()  # raises if the link has failed
             found = _json(client, report)
             if is_live:
-                clear_screen()
+                sys.stdout.write("\x1b[H\x1b[J")  # erases it, for the next table in the same place
                 _print(found)
         tasks.cancel_scope.cancel()
         if not found["frames"]:

@@ -15,7 +15,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from enum import IntEnum
-from typing import Any, ClassVar, Final, Self, TextIO
+from typing import ClassVar, Final, Self, TextIO
 
 import anyio
 import anyio.to_thread
@@ -31,9 +31,7 @@ STDIN: Final = "stdin:"
 LINE_NAMES_MAX: Final = 10
 """Parameters or vehicles that a line names, so that it stays short; it gives the number of further ones."""
 NOTICE_INTERVAL: Final = 0.5
-"""Seconds until a terminal shows the awaited response, as most arrive earlier, and between two updates."""
-DRAW_INTERVAL: Final = 0.1
-"""Seconds between two drawings of the progress."""
+"""Seconds until a terminal shows what is awaited, as most arrives earlier, and between two updates."""
 ERASE: Final = "\r\x1b[K"
 """Moves the cursor of a terminal to the start of the line, and erases the line."""
 GAP: Final = "  "
@@ -41,12 +39,6 @@ GAP: Final = "  "
 SENTENCE_WIDTH_MIN: Final = 20
 """Columns that sentences in the last column of a table take at least; in less they are hard to read."""
 
-_WHOLE: Final[dict[str, Any]] = {
-    "break_long_words": False,
-    "break_on_hyphens": False,
-    "replace_whitespace": False,
-}
-"""Options of `textwrap` with which words and blanks stay as they are."""
 _STYLES: Final = {
     **dict.fromkeys(("set", "accepted", "only right"), "32"),
     **dict.fromkeys(("later", "adjusted", "unproven", "different", "slow"), "33"),
@@ -120,7 +112,10 @@ def _wrapped(text: str, stream: TextIO) -> str:
 def _fold(text: str, width: int) -> list[str]:
     """Return text as lines of at most this width; words, such as names and values, stay whole."""
     indent = text[: len(text) - len(text.lstrip())] + GAP
-    return textwrap.wrap(text, max(width, 1), subsequent_indent=indent, **_WHOLE) or [text]
+    whole = textwrap.TextWrapper(
+        width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
+    return whole.wrap(text) or [text]
 
 
 # Tables
@@ -181,11 +176,6 @@ def cells_of(objects: Mapping[str, Mapping[str, object]], *members: str) -> Iter
     return ([name, *map(each.get, keys)] for name, each in objects.items())
 
 
-def clear_screen() -> None:
-    """Erase a terminal, for a table that is printed again and again in the same place."""
-    sys.stdout.write("\x1b[H\x1b[J")
-
-
 def _styled(text: str, style: str | None) -> str:
     is_plain = style is None or "NO_COLOR" in os.environ or not sys.stdout.isatty()
     return text if is_plain else f"\x1b[{style}m{text}\x1b[0m"
@@ -241,7 +231,7 @@ class Status:
     """
 
     _active: ClassVar[list[Status]] = []
-    _drawn_at: ClassVar[float | None] = None
+    _is_drawn: ClassVar[bool] = False
 
     def __init__(self, awaited: str, title: str = "", heard: Callable[[], str] = lambda: "") -> None:
         self._awaited, self._title, self._heard = awaited, title, heard
@@ -263,37 +253,32 @@ class Status:
             self.erase()
 
     def count(self, received: int, total: int | None) -> None:
-        """Show a progress, and after `DRAW_INTERVAL` the rate since the first one."""
+        """Show a progress at the next update, with the rate since the first one."""
         if not received or self not in self._active:
             return
         now = self._loop.time()
         began, before = self._first = self._first or (now, received)
         self._progress = f"{self._title} {received}/{total or '?'}"
-        if (elapsed := now - began) >= DRAW_INTERVAL:
+        if elapsed := now - began:
             rate = (received - before) / elapsed
             self._progress += f" {rate:.0f}/s"
             if rate and total:
                 self._progress += f", {(total - received) / rate:.0f} s left"
-        if now - (Status._drawn_at or 0.0) >= DRAW_INTERVAL:
-            self._draw()
 
     @classmethod
     def erase(cls) -> None:
         """Erase the line, until it is drawn again."""
-        if cls._drawn_at is not None:
+        if cls._is_drawn:
             sys.stderr.write(ERASE)
             sys.stderr.flush()
-            cls._drawn_at = None
+            cls._is_drawn = False
 
     def _tick(self) -> None:
         self._next = self._loop.call_later(NOTICE_INTERVAL, self._tick)
-        self._draw()
-
-    def _draw(self) -> None:
         line = printable("; ".join(each._text for each in self._active))
         sys.stderr.write(f"{ERASE}{line[: shutil.get_terminal_size().columns - 1]}")
         sys.stderr.flush()
-        Status._drawn_at = self._loop.time()
+        Status._is_drawn = True
 
     @property
     def _text(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import anyio
 
@@ -125,10 +125,10 @@ async def sim(
     """
     kind, spec = parse_link(f"sim:{vehicle.removeprefix('sim:')}"), parse_link(link)
     real = create_link(spec)
-    key = {} if signing_key is None else {"signing_key": read_key(signing_key)}
-    options: dict[str, Any] = {"stream": real.is_stream, "signing_timestamp": timestamp_now(), **key}
+    key = None if signing_key is None else read_key(signing_key)
+    vehicle_end = simulated(kind, stream=real.is_stream, signing_key=key, signing_timestamp=timestamp_now())
     async with task_group() as tasks:
-        opened = await tasks.start(serve_endpoint, simulated(kind, **options).endpoint, real)
+        opened = await tasks.start(serve_endpoint, vehicle_end.endpoint, real)
         where = f"speaks to {spec}"
         if spec.kind in (LinkKind.UDPIN, LinkKind.TCPIN):
             where = f"listens on {replace(spec, port=opened.address[1])}"
