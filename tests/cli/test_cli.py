@@ -31,7 +31,7 @@ from paramclient.errors import ClientClosed, ParamClientError
 from paramclient.links import Peer, SimLink
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.wire import frames, messages
-from tests.commands import Command, Outcome, Put, in_process, leaping, strict
+from tests.commands import Command, Outcome, Put, in_process, strict
 
 ROOT = Path(__file__).parents[2]
 URL = "sim:custom"
@@ -40,13 +40,6 @@ ESCAPE = "\x1b"
 
 HASH = "cf579589"
 """Of the simulated PX4 vehicle's table, as the recordings of the real one have it."""
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run the command line in this process, on simulated time."""
-    leaping(monkeypatch)
-    return in_process(capsys)
 
 
 @pytest.fixture
@@ -507,15 +500,15 @@ def test_the_module_runs_the_command_line() -> None:
 
 
 @pytest.mark.parametrize("arguments", [[], ["fetch"], ["cache", "remove"]], ids=" ".join)
-def test_help_has_examples(command: Command, arguments: Sequence[str]) -> None:
-    helped = command(*arguments, "--help")
+def test_help_has_examples(live_command: Command, arguments: Sequence[str]) -> None:
+    helped = live_command(*arguments, "--help")
     assert (helped.code, helped.err) == (0, "")
     assert helped.out.startswith(f"Usage: {' '.join(['paramclient', *arguments])} ")
     assert f"Examples:\n  {' '.join(['paramclient', *arguments])}" in helped.out
     assert ESCAPE not in helped.out
     if not arguments:
         assert "Exit codes: 0 done;" in helped.out
-        assert command().out == helped.out
+        assert live_command().out == helped.out
 
 
 # Output

@@ -49,7 +49,8 @@ def masked(item: Any) -> Any:
 class Case:
     """Commands that run one after the other with one cache; the outputs of those with --json are compared.
 
-    `URL` stands for a link to the vehicle, `DATA` for the folder of test data.
+    `URL` stands for a link to the vehicle, `DATA` for the folder of test data, `CAMERA` and `DESCRIBED` for
+    the options that choose extended parameters and metadata.
     """
 
     vehicle: Callable[[], Endpoint] | None
@@ -87,11 +88,8 @@ def both() -> Air:
 
 
 FETCH: Final = "fetch URL"
-FETCH_EXTENDED: Final = "fetch URL --vehicle 1/100 --extended"
-CHANGE_EXTENDED: Final = (
-    "save URL TMP/before.json --vehicle 1/100 --extended",
-    "set URL CAM_NAME Rear --vehicle 1/100 --extended",
-)
+FETCH_EXTENDED: Final = "fetch URL CAMERA"
+CHANGE_EXTENDED: Final = ("save URL TMP/before.json CAMERA", "set URL CAM_NAME Rear CAMERA")
 CASES: Final = {
     "fetch_px4": Case(quad, (FETCH + " --json", FETCH + " MC_* --json")),
     "fetch_ardupilot": Case(copter, (FETCH + " --json", FETCH + " --changed --json")),
@@ -99,17 +97,15 @@ CASES: Final = {
     "fetch_all": Case(both, (FETCH + " --vehicle all --json",)),
     "fetch_extended": Case(camera, (FETCH_EXTENDED + " --json",)),
     "get": Case(quad, ("get URL MC_ROLL_P MC_P* --json", "get URL MC_ROLL_PP SYS_AUTOSTART --json")),
-    "get_described": Case(copter, ("get URL RTL_ALT --metadata DATA/apm.pdef.xml --json",)),
+    "get_described": Case(copter, ("get URL RTL_ALT DESCRIBED --json",)),
     "get_all": Case(both, ("get URL RTL_ALT --vehicle all --json",)),
-    "get_extended": Case(camera, ("get URL CAM_NAME CAM_KEY --vehicle 1/100 --extended --json",)),
+    "get_extended": Case(camera, ("get URL CAM_NAME CAM_KEY CAMERA --json",)),
     "set": Case(
         quad, ("set URL MC_ROLL_P 7 SYS_AUTOSTART 4002 --json", "set URL NO_SUCH 7 MC_ROLL_P 8 --json")
     ),
-    "set_described": Case(copter, ("set URL RTL_ALT=100 --metadata DATA/apm.pdef.xml --json",)),
+    "set_described": Case(copter, ("set URL RTL_ALT=100 DESCRIBED --json",)),
     "set_all": Case(both, ("set URL WPNAV_SPEED 400 --vehicle all --json",)),
-    "set_extended": Case(
-        camera, ("set URL CAM_NAME Rear CAM_KEY hex:00 NO_SUCH 1 --vehicle 1/100 --extended --json",)
-    ),
+    "set_extended": Case(camera, ("set URL CAM_NAME Rear CAM_KEY hex:00 NO_SUCH 1 CAMERA --json",)),
     "reset": Case(
         lambda: ArduPilotVehicle(live=()),
         (
@@ -129,9 +125,7 @@ CASES: Final = {
             "show DATA/json/quad.params --json",
         ),
     ),
-    "show_described": Case(
-        copter, (FETCH, "show 1 RTL_ALT --metadata DATA/apm.pdef.xml --json", "show 1 --changed --json")
-    ),
+    "show_described": Case(copter, (FETCH, "show 1 RTL_ALT DESCRIBED --json", "show 1 --changed --json")),
     "show_extended": Case(camera, (FETCH_EXTENDED, "show 1 --extended --json")),
     "diff": Case(
         quad,
@@ -142,20 +136,10 @@ CASES: Final = {
             "diff DATA/json/quad.params DATA/json/quad.param --base 1 --json",
         ),
     ),
-    "diff_defaults": Case(
-        copter, (FETCH, "diff 1 DATA/json/quad.param --base defaults --metadata DATA/apm.pdef.xml --json")
-    ),
-    "diff_extended": Case(
-        camera, (*CHANGE_EXTENDED, "diff URL TMP/before.json --vehicle 1/100 --extended --json")
-    ),
-    "search": Case(
-        copter,
-        (FETCH, "search rtl alt --metadata DATA/apm.pdef.xml --json", "search nothing_of_this --json"),
-    ),
-    "info": Case(
-        copter,
-        (FETCH, "set URL RTL_ALT 2000 --force", "info rtl_alt --metadata DATA/apm.pdef.xml --json"),
-    ),
+    "diff_defaults": Case(copter, (FETCH, "diff 1 DATA/json/quad.param --base defaults DESCRIBED --json")),
+    "diff_extended": Case(camera, (*CHANGE_EXTENDED, "diff URL TMP/before.json CAMERA --json")),
+    "search": Case(copter, (FETCH, "search rtl alt DESCRIBED --json", "search nothing_of_this --json")),
+    "info": Case(copter, (FETCH, "set URL RTL_ALT 2000 --force", "info rtl_alt DESCRIBED --json")),
     "history": Case(
         quad,
         (
@@ -168,12 +152,11 @@ CASES: Final = {
         ),
     ),
     "history_extended": Case(
-        camera,
-        (FETCH_EXTENDED, "set URL CAM_NAME Rear --vehicle 1/100 --extended", "history 1 --extended --json"),
+        camera, (FETCH_EXTENDED, "set URL CAM_NAME Rear CAMERA", "history 1 --extended --json")
     ),
     "save": Case(quad, ("save URL TMP/quad.params --json", "save 1 TMP/quad.param --only MC_* --json")),
     "save_all": Case(both, ("save URL TMP/{system}.params --vehicle all --json",)),
-    "save_extended": Case(camera, ("save URL TMP/camera.json --vehicle 1/100 --extended --json",)),
+    "save_extended": Case(camera, ("save URL TMP/camera.json CAMERA --json",)),
     "apply": Case(
         copter,
         (
@@ -186,8 +169,8 @@ CASES: Final = {
         camera,
         (
             *CHANGE_EXTENDED,
-            "apply URL TMP/before.json --vehicle 1/100 --extended --dry-run --json",
-            "apply URL TMP/before.json --vehicle 1/100 --extended --json",
+            "apply URL TMP/before.json CAMERA --dry-run --json",
+            "apply URL TMP/before.json CAMERA --json",
         ),
     ),
     "restore": Case(
@@ -200,12 +183,7 @@ CASES: Final = {
         ),
     ),
     "restore_extended": Case(
-        camera,
-        (
-            *CHANGE_EXTENDED,
-            "apply URL TMP/before.json --vehicle 1/100 --extended --json",
-            "restore URL --vehicle 1/100 --extended --json",
-        ),
+        camera, (*CHANGE_EXTENDED, "apply URL TMP/before.json CAMERA --json", "restore URL CAMERA --json")
     ),
     "import": Case(None, ("import DATA/px4_full_download.tlog DATA/ardupilot_flight.bin --json",)),
     "cache": Case(quad, (FETCH, "cache list --json", "cache remove 1 --json")),
@@ -228,11 +206,12 @@ def outputs(case: Case, command: Command, put: Put, folder: Path) -> list[Any]:
     """Run the commands of a case; return their names, exit codes and masked JSON lines."""
     url = "" if case.vehicle is None else put(case.vehicle())
     found: list[Any] = []
+    places = {"URL": url, "CAMERA": "--vehicle 1/100 --extended", "DESCRIBED": "--metadata DATA/apm.pdef.xml"}
+    places |= {"DATA": str(DATA), "TMP": str(folder)}
     for line in case.commands:
-        places = {"URL": url, "DATA": str(DATA), "TMP": str(folder)}
-        words = line.split()
         for place, text in places.items():
-            words = [word.replace(place, text) for word in words]
+            line = line.replace(place, text)
+        words = line.split()
         done = command(*words)
         if "--json" not in words:
             assert done.code == 0, done.err

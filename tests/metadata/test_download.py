@@ -105,17 +105,6 @@ async def test_vehicles_without_metadata(make: Any) -> None:
         assert anyio.current_time() - began < 1.5
 
 
-async def test_nothing_is_downloaded_from_the_internet() -> None:
-    vehicle = describing()
-    publish(vehicle, uri="https://example.invalid/parameters.json.xz")
-    async with a_client(vehicle) as client:
-        with pytest.raises(
-            FileError, match=r"https://example\.invalid/.*: 1/1 has its metadata .* not downloaded"
-        ) as caught:
-            await metadata_of(await client.component())
-    assert caught.value.source == "https://example.invalid/parameters.json.xz"
-
-
 async def test_a_file_on_another_component() -> None:
     vehicle, camera = describing(), PX4Vehicle(component=100, table={"CAM_MODE": 1})
     camera.files["/p.json"] = json.dumps({"version": 1, "parameters": [{"name": "CAM_MODE"}]}).encode()
@@ -127,8 +116,20 @@ async def test_a_file_on_another_component() -> None:
             assert isinstance(result, expected), result
 
 
-@pytest.mark.parametrize("wrong", ["checksum", "missing", "damaged", "long"])
-async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("wrong", "error", "said"),
+    [
+        ("checksum", FileError, "does not have the announced checksum"),
+        ("missing", FileTransferError, "file not found"),
+        ("damaged", FileError, f"{METADATA_FILE} of 1/1: cannot be unpacked: the file is truncated"),
+        ("address", FileError, r"mftp://x*: announced by 1/1: .* 1 to 238 bytes"),
+        ("size", FileTransferError, "longer than 400 bytes"),
+        ("place", FileError, r"^https://example\.invalid/p\.xz: 1/1 has its metadata .* not downloaded"),
+    ],
+)
+async def test_a_file_that_is_not_as_announced_or_elsewhere(
+    wrong: str, error: type[Exception], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     vehicle = describing()
     content = vehicle.files[METADATA_FILE]
     if wrong == "checksum":
@@ -138,21 +139,15 @@ async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> No
     elif wrong == "damaged":
         vehicle.files[METADATA_FILE] = content[:-20]
         publish(vehicle, fileCrc=crc32_px4(content[:-20]))
+    elif wrong == "size":
+        monkeypatch.setattr(download, "PACKED_SIZE_MAX", 400)
+        assert len(vehicle.files[GENERAL_FILE]) < 400 < len(content)
     else:
-        publish(vehicle, uri="mftp://" + "x" * 240)
+        publish(vehicle, uri="https://example.invalid/p.xz" if wrong == "place" else "mftp://" + "x" * 240)
     kept = MetadataStore(tmp_path)
-    said = {
-        "checksum": (FileError, "does not have the announced checksum"),
-        "missing": (FileTransferError, "file not found"),
-        "damaged": (
-            FileError,
-            f"mftp://{METADATA_FILE} of 1/1: cannot be unpacked: the file is truncated",
-        ),
-        "long": (FileError, r"mftp://x*: announced by 1/1: .* 1 to 238 bytes"),
-    }[wrong]
     async with a_client(vehicle) as client:
         component = await client.component()
-        with pytest.raises(said[0], match=said[1]):
+        with pytest.raises(error, match=said):
             await metadata_of(component, store=kept)
         assert kept.known(component.identity, 1) is None
         await anyio.sleep(1.0)
@@ -183,15 +178,6 @@ async def test_cancellation_closes_files_and_sessions(tmp_path: Path) -> None:
             await anyio.sleep(1.0)
             assert not vehicle.open_files
             assert await metadata_of(component) is not None
-
-
-async def test_a_too_large_file_is_not_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(download, "PACKED_SIZE_MAX", 400)
-    vehicle = describing()
-    assert len(vehicle.files[GENERAL_FILE]) < 400 < len(vehicle.files[METADATA_FILE])
-    async with a_client(vehicle) as client:
-        with pytest.raises(FileTransferError, match="longer than 400 bytes"):
-            await metadata_of(await client.component())
 
 
 # The metadata cache
