@@ -170,10 +170,11 @@ class _Download:
         await self._read_gaps()
         serves_reads, count = self.session.serves_reads.get(int), self._count
         has_loss = not serves_reads and any(0 < index < self._reached for index in self._lost)
-        for _ in range(1 + (self.table.is_growing and has_loss)):  # also its end may have been lost twice
-            gaps = self._skipped if self.reads_beside else self._gaps()
-            if gaps and count != 1 and not serves_reads and not self.channel.is_silent(self._began):
-                await self._next_pass()
+        left = 0 if serves_reads or count == 1 else 1 + has_loss  # of fruitless passes: one may be lost
+        while left and self._gaps() and not self.channel.is_silent(self._began):
+            before = len(self._received)
+            await self._next_pass()
+            left -= len(self._received) == before
         if not has_loss and not self.channel.is_silent(self._began):
             self.table.end_list()
         self.result.missing = missing = self._missing()

@@ -148,6 +148,13 @@ async def test_a_count_that_is_too_large_costs_seconds_and_no_value(count: int) 
         assert len(conversation.sent) < 1_000
 
 
+@pytest.mark.parametrize("seed", range(6))
+async def test_a_list_of_firmware_without_reads_is_requested_until_it_is_complete(seed: int) -> None:
+    vehicle = Partial(serves=("list",), heartbeat=QUIET)
+    async with talking(Air.symmetric([vehicle], delay=0.01, loss=0.2, seed=seed)) as (_, session):
+        assert (await fetch_all(session)).missing == ()
+
+
 async def test_the_first_value_of_a_list_that_is_lost_is_missing_and_no_other() -> None:
     vehicle = Tap(Partial(serves=("list",)), down=lambda message: getattr(message, "param_index", None) != 0)
     async with talking(vehicle) as (_, session):
