@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from paramclient.cache import CachedComponent, CachedSummary, ParamCache, SnapshotSummary
+from paramclient.cache import CachedSummary, ParamCache, SnapshotSummary
 from paramclient.cache.moments import parse_time
 from paramclient.cli.json_output import JsonObject, history_json, known_members, snapshot_json, taken
 from paramclient.cli.options import CacheOptions
@@ -74,14 +74,6 @@ def show_summaries(cache: ParamCache, summaries: Sequence[CachedSummary], *, jso
     show(listed, columns, rows, json=json, empty="no table is in the cache")
     if not json:
         say(f"the cache is {cache.place}")
-
-
-def load_tables(
-    cache: ParamCache, summaries: Sequence[CachedSummary], *, extended: bool = False
-) -> list[CachedComponent]:
-    """Load tables; another process may have removed one."""
-    loaded = (cache.load(each.key, each.component, extended=extended) for each in summaries)
-    return [table for table in loaded if table is not None]
 
 
 # import
@@ -171,9 +163,9 @@ def history(
     with ParamCache(options.cache) as cache:
         tables = tables_in(cache, vehicle, extended=extended)
         key, component = tables[0].key, component_of(vehicle)
-        kept = cache.snapshots(key, component, extended=extended) if snapshots else []
-        entries = [] if snapshots else cache.history(key, component, extended=extended)
-        loaded = load_tables(cache, tables, extended=extended) if chosen else []
+        kept = cache.snapshots(key, component, extended=extended)
+        entries = cache.history(key, component, since=begin, extended=extended)
+        loaded = cache.load_all(tables, extended=extended)
     if snapshots:
         kept = [each for each in kept if each.at >= (begin or 0)]
         columns = ["id", "time", "component", "params", "hash", "reason"]
@@ -185,7 +177,6 @@ def history(
         known = {each.name for each in entries}.union(*(each.params for each in loaded))
         selected = NameChoice(chosen).choose(known, f" of {key} in the cache")
         entries = [each for each in entries if each.name in selected]
-    entries = [each for each in entries if each.at >= (begin or 0)]
     found = [history_json(each) for each in entries]
     members = ("component", "name", "old", "new", "by")
     rows = ([local_time(each.at), *map(line.get, members)] for each, line in zip(entries, found, strict=True))

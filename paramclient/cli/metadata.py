@@ -145,10 +145,10 @@ def say_sources(label: str, defaults: Iterable[Default | None]) -> None:
 
 
 def no_defaults() -> str:
-    """Return that the defaults are not known, and what to do."""
+    """Return `NO_DEFAULTS`."""
     from paramclient.provision.sources import NO_DEFAULTS  # only here: loads provision
 
-    return f"{NO_DEFAULTS}; {METADATA_HINT}"
+    return NO_DEFAULTS
 
 
 # Subcommands

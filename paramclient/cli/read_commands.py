@@ -25,7 +25,7 @@ from paramclient.cli.output import (
     report_all,
     say,
 )
-from paramclient.cli.session import CommandSession, Sessions, check_given, get_chosen, sessions
+from paramclient.cli.session import CommandSession, Sessions, check_given, get_chosen, noun_of, sessions
 from paramclient.client.client import Event
 from paramclient.errors import ParamClientError, VehicleError
 from paramclient.links import ReplayLink
@@ -142,7 +142,7 @@ def _report_fetch(session: CommandSession, result: FetchResult, defaults: Sequen
         lost = "" if result.source == "cache" else f"{result.lost} lost, {result.repeated} repeated, "
         trip = "" if result.round_trip is None else f"round trip {milliseconds(result.round_trip)}, "
         link = " on the whole link" if len(client.components) > 1 else ""
-        fetched = f"{result.received}{of} {session.noun}s of {label} from {result.source}"
+        fetched = f"{result.received}{of} {noun_of(session.component)}s of {label} from {result.source}"
         traffic = f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent{link}"
         say(f"{fetched} in {result.elapsed:.2f} s, {lost}{trip}{traffic}{crc}")
     if not result.missing:
@@ -190,7 +190,7 @@ async def _watch(session: CommandSession, given: Sequence[str], found: Sessions)
         if errors:
             return report_all(errors.values(), session.prefix)
         is_first = set(component.params)
-    everything = counted(len(component.params), session.noun)
+    everything = counted(len(component.params), noun_of(component))
     say(f"watching {', '.join(given) or everything} of {session.label}")
     if session is found[0]:
         found.report_others()

@@ -20,6 +20,7 @@ from paramclient.errors import AmbiguousVehicle, NoReply, ParamClientError, Unkn
 from paramclient.links import LinkKind
 from paramclient.model.identity import version_text
 from paramclient.model.names import NameChoice, first_of, is_pattern
+from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust, check_name
 from paramclient.protocol.fetch import FetchResult, Progress
 from paramclient.protocol.identity import HEARTBEAT_WAIT, expects_extended
@@ -105,6 +106,11 @@ class ChosenVehicle:
         return cls(system, component, found["uid"] and found["uid"].lower(), bool(found["all"]))
 
 
+def noun_of(params: Component | ParamSet) -> str:
+    """Return the parameters of a component or of a set in words, in the singular."""
+    return "extended parameter" if params.is_extended else "parameter"
+
+
 @dataclass(frozen=True, slots=True)
 class CommandSession:
     """An open client, and a component that the command works on: with --extended, its extended parameters."""
@@ -138,11 +144,6 @@ class CommandSession:
         return f"{self.label}: " if self.choice.is_all else ""
 
     @property
-    def noun(self) -> str:
-        """The parameters of the component in words, in the singular."""
-        return "extended parameter" if self.component.is_extended else "parameter"
-
-    @property
     def receiver(self) -> str:
         """Address, kind and firmware of the component: `1/1 PX4 quadrotor, firmware 1.16.0`."""
         firmware = self.component.identity.firmware
@@ -164,7 +165,8 @@ class CommandSession:
                 received = sum(each.trust is not Trust.CACHED for each in component.params.values())
                 of = "" if component.count is None else f" of {component.count}"
                 kept = "not kept, without a cache" if self.client.cache is None else "kept in the cache"
-                say(f"interrupted: {received}{of} {self.noun}s of {self.label} received and {kept}")
+                what = f"{received}{of} {noun_of(component)}s of {self.label}"
+                say(f"interrupted: {what} received and {kept}")
                 raise
 
     async def check_only(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from paramclient.cache import CachedComponent, ParamCache
-from paramclient.cli.cached import load_tables, show_summaries
+from paramclient.cli.cached import show_summaries
 from paramclient.cli.json_output import info_json, info_of, param_value, set_json, table_param_json, taken
 from paramclient.cli.metadata import (
     METADATA_HINT,
@@ -198,7 +198,7 @@ class _Cached:
         with ParamCache(options.cache) as cache:
             summaries = cache.components() if vehicle is None else tables_in(cache, vehicle)
             summaries = sorted(summaries, key=lambda each: (each.system, each.component))
-            self._tables = tables = load_tables(cache, summaries)
+            self._tables = tables = cache.load_all(summaries)
             store = MetadataStore.beside(cache.path)
         found = [given or store.known(table.identity, table.component) for table in tables]
         self._metadata = [*{id(each): each for each in (given, *found) if each is not None}.values()]

@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Container, Sequence
 from dataclasses import replace
 from functools import partial as bind
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Annotated, Final
 
 import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient.cli.json_output import JsonObject, diff_json, taken
-from paramclient.cli.metadata import MetadataFile, defaults_in, known_of_sets, no_defaults, say_sources
+from paramclient.cli.metadata import MetadataFile, defaults_in, known_of_sets, say_sources
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import ExitCode, listed, local_time, print_json, print_table, report, say
-from paramclient.cli.session import ChosenVehicle, CommandSession, sessions
+from paramclient.cli.session import ChosenVehicle, CommandSession, noun_of, sessions
 from paramclient.client.component import Component
 from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, writable, write_file
-from paramclient.files.formats import ENDINGS, address, format_of_name
+from paramclient.files.formats import address, format_of_name
 from paramclient.links import LinkKind, parse_link
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import compare
@@ -27,11 +27,6 @@ from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.paramset import ParamSet, default_of
 from paramclient.provision import sources
-
-_ENDINGS: Final = frozenset({*ENDINGS, ".bin", ".ulg", ".txt", ".csv"})
-"""Extensions of files with parameters, also of formats that are not readable: a text with one of them is
-meant as a file, and no link name has one."""
-
 
 DEFAULTS: Final = "defaults"
 """The value of --base for the firmware's defaults; a file of this name is `./defaults`."""
@@ -115,16 +110,15 @@ def check_link(text: str) -> None:
     """Check that an argument that is neither a file nor a cached vehicle names a link.
 
     Raises:
-        UsageError: it does not; the message lists the links, unless the text is the name of a file that does
-            not exist.
+        UsageError: it does not; the message lists the links, unless the text can only be a mistyped file or
+            vehicle.
     """
     try:
         if not sources.is_offline(text):
             parse_link(text)
     except UsageError as error:
-        if PurePath(text).suffix.lower() in _ENDINGS:
-            raise UsageError(f"no such file: {text}") from None
-        raise UsageError(f"no such file, nor a vehicle in the cache (cache:VEHICLE); {error}") from None
+        links = f"; {error}" if ":" in text else ""
+        raise UsageError(f"no such file: {text}, nor a vehicle in the cache (cache:VEHICLE){links}") from None
 
 
 def part_of(params: ParamSet, names: Container[str]) -> ParamSet:
@@ -194,10 +188,8 @@ async def save(
         members = [taken(each, "system", "component") | {"params": len(each)} for each in of_file]
         found.append({"path": path, "format": written.value, "components": members})
         if not options.json:
-            contents = ", ".join(
-                f"{counted(len(each), noun_of(each))} of {address(each)}" for each in of_file
-            )
-            say(f"{contents} written to {path} ({written})")
+            contents = [f"{counted(len(each), noun_of(each))} of {address(each)}" for each in of_file]
+            say(f"{', '.join(contents)} written to {path} ({written})")
     if not found:
         report(f"nothing was written to {file}")
     elif options.json:
@@ -211,7 +203,7 @@ def _differing(whole: ParamSet, metadata: Metadata | None) -> ParamSet | None:
     try:
         differing = sources.select_non_defaults(whole, described)
     except UsageError as error:
-        report(f"{address(whole)}: {no_defaults() if str(error) in no_defaults() else error}")
+        report(f"{address(whole)}: {error}")
         return None
     say_sources(address(whole), (default_of(each, described.get(each.name)) for each in differing.values()))
     return differing
@@ -245,9 +237,6 @@ async def diff(
             one is not, those that only the left side has.
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
     """
-    if left == right and not sources.is_offline(left):
-        hint = "`paramclient diff 1 2` compares two vehicles in the cache"
-        raise UsageError(f"both sides are the vehicle on {left}; {hint}")
     given = [left, right, *([] if base in (None, DEFAULTS) else [base or ""])]
     first, second, *third = await resolve_all(given, options)
     if partial and sources.is_file(right) and not sources.is_file(left):
@@ -257,10 +246,7 @@ async def diff(
     known = known_of_sets([first, second, *third], options, metadata)
     before = third[0] if third else None
     if base == DEFAULTS:
-        try:
-            before = sources.collect_defaults([first, second], [*map(defaults_in, known, (first, second))])
-        except UsageError:
-            raise UsageError(no_defaults()) from None
+        before = sources.collect_defaults([first, second], [*map(defaults_in, known, (first, second))])
         known.append(known[0] or known[1])
     outcome = compare(first, second, base=before, names=only or None)
     found = diff_json(outcome, [*known, None][:3], has_defaults=base == DEFAULTS)
@@ -327,11 +313,6 @@ def described(params: ParamSet) -> str:
     ]
     at = "" if params.at is None else f", {local_time(params.at)}"
     return " ".join(filter(None, [counted(len(params), noun_of(params)), *origin])) + at
-
-
-def noun_of(params: ParamSet) -> str:
-    """Return the parameters of a set in words, in the singular."""
-    return "extended parameter" if params.is_extended else "parameter"
 
 
 def is_pattern_name(name: str) -> bool:

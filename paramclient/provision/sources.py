@@ -35,7 +35,8 @@ NAMES_SHOWN_MAX: Final = 20
 """Parameters that a message names, so that it stays readable; it gives the number of further ones."""
 NO_DEFAULTS: Final = (
     "the firmware's defaults are not known: they come with the parameter file over MAVFTP, which ArduPilot "
-    "and PX4 from 1.18 on serve, or with the metadata of the firmware"
+    "and PX4 from 1.18 on serve, or with the metadata of the firmware, which `paramclient fetch LINK "
+    "--metadata vehicle` and `paramclient metadata add FILE` store"
 )
 """The message for a request that needs the firmware's defaults when no parameter has one."""
 _CACHED: Final = "cache:"
@@ -116,8 +117,8 @@ def read_source(
             tables = [each for each in tables if each.component == AUTOPILOT]
             if not tables:
                 raise UsageError(f"no autopilot is among {known}; name one of them instead of {text}")
-        loaded = [opened.load(each.key, each.component, extended=extended) for each in tables]
-    sets = [_cached_set(each, extended=extended, partial=incomplete) for each in loaded if each is not None]
+        loaded = opened.load_all(tables, extended=extended)
+    sets = [_cached_set(each, extended=extended, partial=incomplete) for each in loaded]
     if not sets:  # removed meanwhile
         raise NotInCache(f"the cache has no table of {text}")
     return ParamFile(tuple(sets), FileFormat.JSON, sets[0].source)

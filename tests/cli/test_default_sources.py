@@ -55,7 +55,7 @@ def test_unknown_defaults_are_an_error_that_says_what_to_do(command: Command, pu
     done = command("fetch", put(quad()), "--changed")
     assert (done.code, done.out) == (1, "")
     assert "defaults are not known" in done.err
-    assert "--metadata vehicle` requests metadata from a vehicle that serves it" in done.err
+    assert "--metadata vehicle` and `paramclient metadata add FILE` store" in done.err
 
 
 # without a link, and files
@@ -103,7 +103,7 @@ def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
     words = ("diff", "1", file, "--partial", "--base", "defaults")
     unknown = command(*words)
     assert unknown.code == 2
-    assert "`paramclient fetch LINK --metadata vehicle` requests metadata" in unknown.err
+    assert "`paramclient fetch LINK --metadata vehicle`" in unknown.err
     assert command("fetch", put(quad()), "--metadata", "vehicle").code == 0
     found = command(*words, "--json").json
     assert {
