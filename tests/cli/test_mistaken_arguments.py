@@ -42,6 +42,13 @@ NO_VALUE = "set takes pairs of NAME and VALUE, or NAME=VALUE"
         ("fetch sim:px4 --timeout 0", 'Invalid value "0.0" for --timeout. It must be a number of seconds'),
         ("fetch sim:px4 --no-cache --cache x", "Invalid values for group Cache. Mutually exclusive"),
         ("fetch sim:px4 --encoding json", 'Invalid value "json" for --encoding. Choose from: "bytewise"'),
+        ("get sim:px4 A --vehicle 4/300", "system ids are 1 to 255, component ids 0 to 255, not 300"),
+        ("get sim:px4 A --vehicle 0", "system ids are 1 to 255, component ids 0 to 255, not 0"),
+        ("get sim:px4 A --vehicle px4", "--vehicle px4: a vehicle is written as 4, as 4/1"),
+        ("get sim:px4 A --vehicle uid:0a0a", "--vehicle uid:0a0a: a vehicle is written as 4, as 4/1"),
+        ("get sim:px4 A --vehicle ", "--vehicle : a vehicle is written as 4, as 4/1"),
+        ("save sim:px4 new.param --format exe", 'Invalid value "exe" for --format. Choose from: "qgc"'),
+        ("save 1 new.param --no-cache", "'1' is a vehicle in the cache, which --no-cache excludes"),
         ("fect sim:px4", 'Unknown command "fect". Did you mean "fetch"?'),
         ("history", 'Command "history" parameter VEHICLE requires an argument.'),
         ("get MC_ROLL_P", 'Command "get" parameter NAME requires an argument. Usage: paramclient get'),
@@ -52,6 +59,7 @@ def test_a_mistaken_argument_is_named(command: Command, words: str, text: str) -
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err.startswith(f"paramclient: {text}")
     assert outcome.err.count("\n") == 1 or text.startswith("link name"), "whose forms are listed"
+    assert not Path("new.param").exists()
 
 
 @pytest.mark.parametrize(

@@ -41,22 +41,6 @@ def test_save_needs_no_link_for_a_vehicle_in_the_cache(command: Command, cache: 
     assert params.at == pytest.approx(table.synced_at, abs=1e-5), "not the present time"
 
 
-@pytest.mark.parametrize(
-    ("words", "problem"),
-    [
-        (["1", "--no-cache"], "'1' is a vehicle in the cache, which --no-cache excludes"),
-        (["1", "--format", "exe"], "exe"),
-        (["7"], "7 is not in the cache"),
-    ],
-)
-def test_without_a_source_or_a_format_nothing_is_written(
-    words: list[str], problem: str, command: Command, tmp_path: Path
-) -> None:
-    saved = command("save", words[0], tmp_path / "quad.param", *words[1:])
-    assert (saved.code, saved.out, problem in saved.err) == (2, "", True)
-    assert not (tmp_path / "quad.param").exists()
-
-
 def test_save_writes_parameters_that_differ_from_the_defaults(command: Command, tmp_path: Path) -> None:
     for where in ("sim:ardupilot", "1"):
         path = tmp_path / "quad.param"

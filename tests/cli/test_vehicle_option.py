@@ -55,22 +55,6 @@ def test_two_vehicles_with_the_same_beginning_of_the_hardware_id(command: Comman
     assert (one.requests["PARAM_SET"], two.requests["PARAM_SET"]) == (0, 0)
 
 
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("4/300", "ids are 1 to 255, component ids 0 to 255"),
-        ("0", "ids are 1 to 255, component ids 0 to 255"),
-        ("px4", "a vehicle is written as 4, as 4/1"),
-        ("uid:0a0a", "a vehicle is written as 4, as 4/1"),
-        ("", "a vehicle is written as 4, as 4/1"),
-    ],
-)
-def test_names_that_name_nothing(command: Command, put: Put, name: str, reason: str) -> None:
-    tried = command("get", put(copter()), "A", "--vehicle", name)
-    assert (tried.code, tried.out) == (2, "")
-    assert reason in tried.err
-
-
 def test_a_read_says_which_vehicle_it_shows(command: Command, put: Put) -> None:
     """Without an option, the first vehicle received is read, which may be another one next time."""
     url = put(Air([px4(), copter()]))
