@@ -108,8 +108,7 @@ class _LogPrinter(logging.Handler):
         if record.levelno >= logging.WARNING:
             report(f"{record.levelname.lower()}: {record.getMessage()}")
         else:
-            name = record.name.removeprefix("paramclient.")
-            say(f"{record.relativeCreated / 1000:8.3f} {name}: {record.getMessage()}")
+            say(f"{record.relativeCreated / 1000:8.3f} {record.name}: {record.getMessage()}")
 
 
 @contextmanager

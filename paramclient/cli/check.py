@@ -13,7 +13,7 @@ import anyio
 from paramclient.cli.json_output import JsonObject, taken, vehicle_json
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import ExitCode, Status, milliseconds, print_json, print_line, print_table
-from paramclient.cli.session import ChosenVehicle, Deadline, listen, wait_for_vehicle
+from paramclient.cli.session import ChosenVehicle, Deadline, open_client, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import LinkError, ParamClientError, UsageError
@@ -84,7 +84,7 @@ async def check(
     """
     choice = ChosenVehicle.parse(vehicle, one="check measures one vehicle")
     deadline = Deadline(timeout, CHECK_TIMEOUT)
-    async with listen(url, options) as client:
+    async with open_client(url, options, cache=False, traffic=True) as client:
         if client.listens_only:
             raise UsageError(f"{client.link.name} is a log: check needs a link to a vehicle")
         found = _Check(client, await wait_for_vehicle(client, choice, deadline), deadline)
@@ -124,16 +124,8 @@ class _Check:
     async def measure(self) -> None:
         """Measure everything."""
         began = anyio.current_time()
-        steps = {
-            "identification": self._identify,
-            "round trip": self._round_trip,
-            "hash": self._hash,
-            "list download": self._list,
-            "parameter file": self._file,
-            "loss": self._loss,
-        }
-        for what, step in steps.items():
-            with Status(f"measuring: {what}"):
+        with Status(f"measuring {node_in_words(self._component.node)}"):
+            for step in (self._identify, self._round_trip, self._hash, self._list, self._file, self._loss):
                 await step()
         self.json["elapsed_s"] = elapsed = round(anyio.current_time() - began, 3)
         self.rows.append(("measured in", f"{elapsed:.1f} s"))
@@ -160,13 +152,13 @@ class _Check:
                 with anyio.fail_after(self._deadline.left(MEASURE_TIMEOUT)):
                     await request_message(self._component.node.channel, AutopilotVersion)
                 trips.append(round(anyio.current_time() - began, 4))
-        found = {"count": len(trips), "median_s": median(trips), "max_s": max(trips)} if trips else None
-        self.json["link"] = {"name": self._client.link.name, "round_trip": found}
+        self.json["link"] = {"name": self._client.link.name, "round_trip": None}
         if not trips:
             self.rows.append(("round trip", "no command was acknowledged"))
             self.findings.append(("problem", NO_ACKNOWLEDGEMENT))
             return
         middle, most = median(trips), max(trips)
+        self.json["link"]["round_trip"] = {"count": len(trips), "median_s": middle, "max_s": most}
         words = f"{milliseconds(middle)} (at most {milliseconds(most)}, {len(trips)} commands)"
         self.rows.append(("round trip", words))
         if middle >= ROUND_TRIP_LONG:

@@ -12,7 +12,7 @@ import anyio
 from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import Seconds, TrafficOptions
 from paramclient.cli.output import milliseconds, print_json, print_line, print_table, show
-from paramclient.cli.session import Deadline, listen, received_in_words
+from paramclient.cli.session import Deadline, open_client, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
 from paramclient.client.taps import ComponentTraffic, TrafficReport
@@ -58,7 +58,8 @@ async def link(
     """
     is_live = sys.stdout.isatty() and not options.json
     deadline = Deadline(seconds, None if is_live else LINK_LISTENING_TIME)
-    async with listen(url, options, listen_only=listen_only) as client, task_group() as tasks:
+    opened = open_client(url, options, cache=False, traffic=True, listen_only=listen_only)
+    async with opened as client, task_group() as tasks:
         tasks.start_soon(_measure_round_trips, client)
         while left := deadline.left(REFRESH_INTERVAL):
             await anyio.sleep(left)

@@ -130,11 +130,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Non
             numbers is aligned at the right.
     """
     cells, begin = [*rows], 0
-    kept = [
-        column
-        for column in zip(columns, *cells, strict=True)
-        if not cells or any(cell is not None for cell in column[1:])
-    ]
+    kept = [column for column in zip(columns, *cells, strict=True) if {*column[1:]} != {None}]
     lines = [""] * (len(cells) + 1)
     for column in kept:
         texts = ["" if cell is None else printable(str(cell)) for cell in column]

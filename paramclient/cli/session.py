@@ -310,7 +310,7 @@ async def sessions(
     is_log = url.lower().startswith(f"{LinkKind.REPLAY}:")
     link = f"{url}?speed=0" if is_log and not is_live and "?speed=" not in url else url
     more = {"encoding": options.encoding, "listen_only": options.listen_only}
-    async with _client(link, options, cache=options.place, **more) as client:
+    async with open_client(link, options, cache=options.place, **more) as client:
         if choice.is_all:
             with _waiting(client, "vehicles"):
                 found = await client.find_autopilots(timeout=deadline.heartbeat_timeout)
@@ -332,16 +332,12 @@ async def sessions(
         yield Sessions(CommandSession(client, each, deadline, options, choice) for each in found)
 
 
-def listen(url: str, options: TrafficOptions, *, listen_only: bool = False) -> ParamClient:
-    """Return a client that counts all traffic, and neither reads nor writes a cache.
+def open_client(url: str, options: TrafficOptions, **more: Any) -> ParamClient:
+    """Return a client with the options of the command line, and further arguments of `ParamClient`.
 
     Raises:
         UsageError: no such link.
     """
-    return _client(url, options, cache=False, traffic=True, listen_only=listen_only)
-
-
-def _client(url: str, options: TrafficOptions, **more: Any) -> ParamClient:
     system, signing = options.source_system, options.signing
     return ParamClient(url, tlog=options.tlog, signing=signing, system=system, **more)
 
@@ -408,7 +404,7 @@ async def _find_by_uid(client: ParamClient, uid: str, timeout: float | None) -> 
     def fitting() -> list[Component]:
         return [each for each in client.autopilots if (each.identity.uid or "").startswith(uid)]
 
-    began, awaited = anyio.current_time(), f"a vehicle with hardware id {uid}"
+    awaited = f"a vehicle with hardware id {uid}"
     with _waiting(client, awaited), anyio.move_on_after(timeout):
         while not (found := fitting()):
             await client.core.link_task.wait_for_activity()
@@ -419,8 +415,7 @@ async def _find_by_uid(client: ParamClient, uid: str, timeout: float | None) -> 
         words = [node_in_words(each.node) for each in found]
         what = f"{len(words)} vehicles on this link have hardware ids that begin with {uid}"
         raise AmbiguousVehicle(f"{what}: {', '.join(words)}.", vehicles=words, choose_by="system")
-    waited = anyio.current_time() - began
-    raise NoReply(awaited, attempts=0, waited=waited, hint=received_in_words(client))
+    raise NoReply(awaited, attempts=0, waited=timeout or 0.0, hint=received_in_words(client))
 
 
 def _waiting(client: ParamClient, awaited: str) -> Status:
