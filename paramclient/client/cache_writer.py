@@ -121,17 +121,13 @@ class CacheWriter:
                 is_known = node.identification.is_settled
                 if is_known or any(each.table.is_complete for each in node.sessions):
                     await self.load(node, vehicle_of(nodes, node))
-            wait = CLOSE_WAIT_MAX if self._has_written else CLOSE_RETRY_INTERVAL
-            deadline = anyio.current_time() + wait
-            while True:
+            for attempt in range(int(CLOSE_WAIT_MAX / CLOSE_RETRY_INTERVAL) if self._has_written else 2):
+                await anyio.sleep(CLOSE_RETRY_INTERVAL if attempt else 0.0)
                 with suppress(CacheError):
                     await self.write_all()
                     await self.write_all()  # after a replaced file
                     is_written = True
                     break
-                if anyio.current_time() >= deadline:
-                    break
-                await anyio.sleep(CLOSE_RETRY_INTERVAL)
         lost = () if is_written or was_warned else self._identities.items()
         for node, identity in lost:
             if any(self._record(node, session).is_unwritten for session in node.sessions):
@@ -167,13 +163,12 @@ class CacheWriter:
             self._identities[node] = identity
             self._wake()
             return
-        cache = self.cache
         for session in node.sessions:
             is_extended = session is node.extended
             cached = None
             with suppress(CacheError):
                 cached = await self._call(
-                    partial(cache.load, identity.key, node.component, extended=is_extended)
+                    partial(self.cache.load, identity.key, node.component, extended=is_extended)
                 )
             if vehicle.identification.identity.key != identity.key:
                 return  # another vehicle has taken the address meanwhile, and its table is loaded
@@ -183,11 +178,11 @@ class CacheWriter:
                 self._record(node, session).is_whole = True
             if cached is None:
                 continue
+            known = cached.identity
             if vehicle.identification.autopilot is None:  # no heartbeat yet
-                known = cached.identity
                 identity = replace(identity, autopilot=known.autopilot, vehicle_type=known.vehicle_type)
             self._records.setdefault(session, TableRecord(node.generation)).synced_at = cached.synced_at
-            is_same_firmware = _firmware(cached.identity) == _firmware(identity)
+            is_same_firmware = (known.firmware, known.git_hash) == (identity.firmware, identity.git_hash)
             params, ahead, now = cached.params.values(), self._seconds_ahead(), anyio.current_time()
             session.table.load(
                 params if is_same_firmware else [replace(each, default=None) for each in params],
@@ -259,8 +254,7 @@ class CacheWriter:
         Raises:
             CacheError: the write failed. The values stay in memory and are written later.
         """
-        cache = self.cache
-        if cache is None:
+        if self.cache is None:
             return
         async with self._writing:
             certain = [node for node in self._identities if self._is_certain(node)]
@@ -272,20 +266,20 @@ class CacheWriter:
             before = [(record, len(record.changes), record.is_whole) for _, _, record in taken]
             for _, _, record in taken:
                 record.is_whole = False
-            is_saved = self._is_synced = False
+            self._is_synced = False
             try:
-                await self._call(partial(cache.save, updates, durable=durable))
-                is_saved = self._has_written = True
-            finally:
-                for record, count, was_whole in before:
-                    if is_saved:
-                        del record.changes[:count]
-                    else:
-                        record.is_whole |= was_whole
+                await self._call(partial(self.cache.save, updates, durable=durable))
+            except BaseException:
+                for record, _, was_whole in before:
+                    record.is_whole |= was_whole
+                raise
+            for record, count, _ in before:
+                del record.changes[:count]
+            self._has_written = True
             self._is_synced = durable
             self.failure = None
-            if cache.replacements != self._replacements:  # a new file, without the earlier values
-                self._replacements = cache.replacements
+            if self.cache.replacements != self._replacements:  # a new file, without the earlier values
+                self._replacements = self.cache.replacements
                 for _, _, record in records:
                     record.is_whole = True
                 self._wake()
@@ -429,7 +423,3 @@ def choose_cache(
     if cache is False or is_log:
         return None
     return ParamCache(None if cache is None or cache is True else cache)
-
-
-def _firmware(identity: Identity) -> tuple[int, str]:
-    return identity.firmware, identity.git_hash

@@ -16,11 +16,12 @@ from paramclient.cache import ParamCache
 from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
 from paramclient.client.core import ClientCore
-from paramclient.client.signing import Signing, refused_in_words
+from paramclient.client.signing import Signing
 from paramclient.client.streams import Stream, Subscribers
 from paramclient.client.taps import Capture, Traffic, TrafficReport
 from paramclient.errors import AnotherVehicle, CacheError, ClientClosed, NoReply, ParamClientError, UsageError
 from paramclient.links import Link, ReplayLink, SimLink, create_link
+from paramclient.model.identity import check_ids
 from paramclient.model.names import counted
 from paramclient.model.values import Encoding
 from paramclient.protocol import selection
@@ -49,8 +50,6 @@ LISTENING_TIME: Final = HEARTBEAT_WAIT
 SILENT_TIME: Final = 2.95
 """Seconds from the begin for a component that has never answered a request, where another one on the link
 answers: it costs no more than 3 s."""
-EVENTS_MAX: Final = 1_000
-"""Queued events for a consumer, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +78,7 @@ class Event:
 class Events(Stream[Event]):
     """Stream of the component events since its creation; see `ParamClient.events`."""
 
-    most = EVENTS_MAX
+    most = 1_000
 
 
 class ParamClient:
@@ -143,15 +142,10 @@ class ParamClient:
         signing: Signing | SigningKey | None = None,
         split_peers: bool = False,
     ) -> None:
-        for number in (system, component):
-            if not 1 <= number <= 255:
-                raise UsageError(f"the client's system and component ids must be 1 to 255, not {number}")
+        check_ids(system, component, least=1)
         if watch_interval is not None and watch_interval != 0 and not watch_interval >= INTERVAL_MIN:
             raise UsageError(f"watch_interval must be 0 or at least {INTERVAL_MIN:g} s, not {watch_interval}")
-        try:
-            self.policy = Policy(policy)
-        except ValueError:
-            raise UsageError(f"policy must be one of {', '.join(Policy)}, not {policy!r}") from None
+        self.policy = Policy(policy)
         if listen_only and (watch_interval or self.policy is not Policy.AUTO):
             raise UsageError("the client only listens: it takes no policy, and no watch_interval but 0")
         self.link = opened = create_link(link)
@@ -447,7 +441,34 @@ class ParamClient:
             if system in (None, each.system) and each.node.identification.has_parameters
         }
         left = None if timeout is None else deadline - anyio.current_time()
-        return await _fetch_components(chosen, began, refresh=refresh, timeout=left)
+        results: dict[Address, FetchResult] = {}
+        silent: dict[Address, NoReply | CacheError] = {}
+        scopes: dict[Address, anyio.CancelScope] = {}
+
+        async def fetch(address: Address, component: Component) -> None:
+            awaited = f"the parameters of {component.node.channel}"
+            try:
+                with component.limited(None, awaited, sends=False) as scopes[address]:
+                    results[address] = await component.fetch_all(refresh=refresh, timeout=left)
+            except (NoReply, CacheError) as error:
+                silent[address] = error
+
+        async def give_up_silent() -> None:
+            await anyio.sleep_until(began + SILENT_TIME)
+            if any(each.node.channel.answered.is_set() for each in chosen.values()):
+                for address, each in chosen.items():
+                    if each.count is None and not each.node.channel.answered.is_set():
+                        scopes[address].cancel()
+
+        async with task_group() as tasks:
+            tasks.start_soon(give_up_silent)
+            async with task_group() as fetches:
+                for address, component in chosen.items():
+                    fetches.start_soon(fetch, address, component)
+            tasks.cancel_scope.cancel()
+        if silent and not results:
+            raise next(iter(silent.values()))
+        return FetchedAll(results, silent)
 
     def traffic_report(self) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss.
@@ -523,9 +544,7 @@ class ParamClient:
         began = anyio.current_time()
         station = self.core.station
         system, component = asked
-        for number, least in zip(asked, (1, 0), strict=True):
-            if number is not None and not least <= number <= 255:
-                raise UsageError(f"system ids are 1 to 255, component ids 0 to 255, not {number}")
+        check_ids(system, component)
         probe_at = 0.0 if system and component else math.inf
         found = choose()
         with anyio.move_on_after(timeout):
@@ -542,7 +561,9 @@ class ParamClient:
                 await self._components[found.address].wait_for_cache()
         if isinstance(found, Node):
             return self._components[found.address]
-        refused = refused_in_words(self.signing_report())
+        report = self.signing_report()
+        reasons = [] if report is None else [f"{count} for: {why}" for why, count in report.refused.items()]
+        refused = f" (frames were refused, {', '.join(reasons)})" if reasons else ""
         hint = "" if refused else selection.hint_of_link(station, self.bytes_received)
         if found is not None:
             hint, awaited = "", f"{awaited}, then {HEARTBEAT_WAIT} s without another vehicle"
@@ -566,43 +587,3 @@ class FetchedAll:
     def complete(self) -> bool:
         """Whether `results` has every parameter of every component that responded."""
         return all(result.complete for result in self.results.values())
-
-
-async def _fetch_components(
-    components: Mapping[Address, Component], began: float, *, refresh: bool, timeout: float | None
-) -> FetchedAll:
-    """Fetch the tables of components in parallel; see `ParamClient.fetch_all`, which began at `began`.
-
-    Raises:
-        NoReply: none responded.
-        UsageError: `refresh` is given, and the client may not download.
-        LinkError: the link failed, or the client was closed.
-    """
-    results: dict[Address, FetchResult] = {}
-    silent: dict[Address, NoReply | CacheError] = {}
-    scopes: dict[Address, anyio.CancelScope] = {}
-
-    async def fetch(address: Address, component: Component) -> None:
-        try:
-            with component.limited(None, f"the parameters of {component.node.channel}") as scopes[address]:
-                results[address] = await component.fetch_all(refresh=refresh, timeout=timeout)
-        except (NoReply, CacheError) as error:
-            silent[address] = error
-
-    async def give_up_silent() -> None:
-        await anyio.sleep_until(began + SILENT_TIME)
-        has_answered = {at: each.node.channel.answered.is_set() for at, each in components.items()}
-        if any(has_answered.values()):
-            for address, each in components.items():
-                if not has_answered[address] and each.count is None:
-                    scopes[address].cancel()
-
-    async with task_group() as tasks:
-        tasks.start_soon(give_up_silent)
-        async with task_group() as fetches:
-            for address, component in components.items():
-                fetches.start_soon(fetch, address, component)
-        tasks.cancel_scope.cancel()
-    if silent and not results:
-        raise next(iter(silent.values()))
-    return FetchedAll(results, silent)

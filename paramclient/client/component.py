@@ -16,7 +16,6 @@ from paramclient.client.core import ClientCore
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
 from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, NotDurable, ParamClientError, UsageError
-from paramclient.links import Link
 from paramclient.links.tlog import ReplayLink
 from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.paramset import ParamMap
@@ -85,7 +84,6 @@ class Owner(Protocol):
     """What a component and its callers use of its client; see `paramclient.client.client`."""
 
     core: ClientCore
-    link: Link
     policy: Policy
     watch_interval: float | None
 
@@ -260,7 +258,6 @@ class Component:
             check_portable_name(name)
         elif not isinstance(name, int) or not 0 <= name < PARAMETERS_MAX:
             raise UsageError(f"parameter index {name}: indices are 0 to {PARAMETERS_MAX - 1}")
-        self.core.station.check_may_send()
         with self.limited(timeout, f"parameter {name} of {self.system}/{self.component}"):
             return await read_param(self.session, name)
 
@@ -414,7 +411,7 @@ class Component:
         began, generation = anyio.current_time(), self.node.generation
         if timeout is None and self._waits_for_others:
             timeout = PASSIVE_TIMEOUT
-        with self.limited(None, "all parameters"):
+        with self.limited(None, "all parameters", sends=False):
             with anyio.move_on_after(timeout):
                 if not refresh:
                     await self.wait_for_cache()
@@ -531,7 +528,6 @@ class Component:
             NoReply: it did not answer, or did not come back in time.
             LinkError: the link failed, or the client was closed.
         """
-        self.core.station.check_may_send()
         moves = system is not None and system != self.system
         with self.limited(timeout, f"{self.system}/{self.component} to be back after its reboot"):
             await commands.reboot(self.node, returns=not moves)
@@ -563,7 +559,6 @@ class Component:
             NoReply: it does not answer.
             LinkError: the link failed, or the client was closed.
         """
-        self.core.station.check_may_send()
         with self.limited(timeout, f"{path} of {self.node.channel}"):
             return await ftp.read_file(self.node.channel, path, size_max=size_max, progress=progress)
 
@@ -573,7 +568,6 @@ class Component:
         Raises:
             UsageError, FileTransferError, NoReply, LinkError: as from `read_file`.
         """
-        self.core.station.check_may_send()
         with self.limited(timeout, f"{path} of {self.node.channel}"):
             return await ftp.checksum(self.node.channel, path)
 
@@ -644,9 +638,8 @@ class Component:
             what = f"two vehicles use the ids {words}; nothing was written."
             raise AmbiguousVehicle(what, vehicles=[words], choose_by="peer")
         if durable:
-            if self.core.cache is not None:
-                with anyio.move_on_after(CACHE_TIMEOUT):
-                    await self.cache_is_read.wait()
+            with anyio.move_on_after(0.0 if self.core.cache is None else CACHE_TIMEOUT):
+                await self.cache_is_read.wait()
             self.core.cache_writer.check_kept(self.node)
         return checked
 
@@ -658,8 +651,13 @@ class Component:
             raise NotDurable(f"{where} has accepted {what}, but it is not on the disk: {error}") from error
 
     @contextmanager
-    def limited(self, timeout: float | None, what: str) -> Iterator[anyio.CancelScope]:
-        """Raise NoReply at a timeout, or when the scope is cancelled; add to each what was received."""
+    def limited(self, timeout: float | None, what: str, *, sends: bool = True) -> Iterator[anyio.CancelScope]:
+        """Raise NoReply at a timeout, or when the scope is cancelled; add to each what was received.
+
+        Where a call sends, raise UsageError if the client only listens, and LinkError without a link.
+        """
+        if sends:
+            self.core.station.check_may_send()
         began = anyio.current_time()
         try:
             with anyio.move_on_after(timeout) as scope:

@@ -64,8 +64,7 @@ class ClientCore:
         self.cache_writer = cache_writer
         self.cache = cache_writer.cache
         self.is_over = False
-        self._taps = list(taps)
-        self.link_task = LinkTask(link, taps=self._taps, ended=self._link_ended)
+        self.link_task = LinkTask(link, taps, ended=self._link_ended)
         self._signing = signing
         self._ended = ended
         self._work: anyio.abc.TaskGroup | None = None
@@ -84,7 +83,7 @@ class ClientCore:
 
     def add_tap(self, tap: Tap) -> None:
         """Pass all frames of the link also to this receiver; before `open`."""
-        self._taps.append(tap)
+        self.link_task.taps.append(tap)
 
     def spawn(self, work: Callable[..., Any], *arguments: Any) -> None:
         """Run a function in the background. Its errors are logged, and never end the link."""
@@ -164,7 +163,7 @@ class ClientCore:
         try:
             await self.link.open()
             await self.cache_writer.open()
-            for tap in self._taps:
+            for tap in self.link_task.taps:
                 await tap.open()
             if self._signing is not None:
                 self.station.begin_signing(*self._signing.begin())
@@ -174,7 +173,7 @@ class ClientCore:
                 io.start_soon(self.link_task.read, name="paramclient reader")
                 io.start_soon(self.link_task.send, name="paramclient sender")
                 io.start_soon(self.cache_writer.run, name="paramclient cache writer")
-                for tap in self._taps:
+                for tap in self.link_task.taps:
                     io.start_soon(tap.run)
                 try:
                     async with anyio.create_task_group() as self._work:
@@ -200,7 +199,7 @@ class ClientCore:
             closing: list[Callable[[], Awaitable[None]]] = [
                 partial(self.cache_writer.close, self.station.nodes.values()),
                 self.link_task.flush,  # the last messages of conversations that were ended
-                *(tap.close for tap in self._taps),
+                *(tap.close for tap in self.link_task.taps),
                 self.link.close,
             ]
             for close in closing:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Final
 
@@ -47,10 +47,10 @@ class LinkTask:
 
     Args:
         link: an open link.
-        taps: receivers of all frames on the link.
         ended: called when a log has ended, or the link has failed for good.
 
     Attributes:
+        taps: receivers of all frames on the link.
         station: takes the received data; set before `read`.
         is_disconnected: whether the link is disconnected and being reopened.
         bytes_received, bytes_sent: on this link.
@@ -60,14 +60,14 @@ class LinkTask:
 
     station: Station
 
-    def __init__(self, link: Link, *, taps: Sequence[Tap], ended: Callable[[], None]) -> None:
+    def __init__(self, link: Link, taps: Iterable[Tap], *, ended: Callable[[], None]) -> None:
         self.is_disconnected = False
         self._activity = anyio.Event()
         self.bytes_received = self.bytes_sent = 0
         self.cutter = FrameCutter(stream=link.is_stream)
         self.accepts: Callable[[bytes, Peer], bool] = lambda data, peer: True
         self._link = link
-        self._taps = taps
+        self.taps = list(taps)
         self._ended = ended
         self._queue: deque[tuple[bytes, Peer | None]] = deque()
         self._forwarded: deque[bytes] = deque()
@@ -145,7 +145,7 @@ class LinkTask:
         while self._queue or self._forwarded:
             data, peer = self._queue.popleft() if self._queue else (self._forwarded.popleft(), None)
             self.bytes_sent += len(data)
-            for tap in self._taps:
+            for tap in self.taps:
                 tap.sent(data)
             with suppress(LinkError):  # the reader reconnects; unanswered requests are repeated
                 await self._link.send(data, peer)
@@ -160,9 +160,9 @@ class LinkTask:
 
     def _show(self, data: bytes, peer: Peer) -> None:
         """Pass received data to the taps."""
-        if self._taps:
+        if self.taps:
             frames = self.cutter.cut(data, peer)
-            for tap in self._taps:
+            for tap in self.taps:
                 tap.received(frames, len(data), peer)
 
     async def _reconnect(self, error: LinkError) -> None:

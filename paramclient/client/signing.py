@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.errors import UsageError
-from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, SigningReport, Verifier, timestamp_of
+from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier, timestamp_of
 
 KEY_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY"
 """Environment variable with the key in 64 hexadecimal digits or base64."""
@@ -45,9 +45,7 @@ class Signing:
     link_id: int = 0
 
     def __post_init__(self) -> None:
-        if self.policy not in list(SigningPolicy):
-            known = ", ".join(SigningPolicy)
-            raise UsageError(f"unknown signing policy {self.policy!r}; choose one of {known}")
+        SigningPolicy(self.policy)  # raises UsageError for an unknown one
         if not 0 <= self.link_id <= 255:
             raise UsageError(f"a signing link id must be 0 to 255, not {self.link_id}")
 
@@ -141,10 +139,3 @@ def key_from_environment(environment: Mapping[str, str] = os.environ) -> Signing
 def timestamp_now() -> int:
     """Return the current time of the system clock as a signature timestamp."""
     return timestamp_of(time.time())
-
-
-def refused_in_words(report: SigningReport | None) -> str:
-    """Return the numbers of refused frames with reasons, as the end of a message; "" if there are none."""
-    refused = {} if report is None else report.refused
-    reasons = ", ".join(f"{count} for: {reason}" for reason, count in refused.items())
-    return f" (frames were refused, {reasons})" if reasons else ""

@@ -5,15 +5,12 @@ from __future__ import annotations
 import weakref
 from collections.abc import AsyncIterator
 from dataclasses import replace
-from typing import ClassVar, Final, Generic, Self, TypeVar
+from typing import ClassVar, Generic, Self, TypeVar
 
 import anyio
 
 from paramclient.errors import ParamClientError
 from paramclient.protocol.table import Change
-
-CHANGES_MAX: Final = 100_000
-"""Queued changes for a consumer, one for each name, at most: more than a table holds."""
 
 Item = TypeVar("Item")
 
@@ -66,7 +63,7 @@ class Changes(Stream[Change]):
     A slow consumer receives several changes of one parameter as one.
     """
 
-    most = CHANGES_MAX
+    most = 100_000  # more than a table has names
 
     def push(self, item: Change) -> None:
         """Add a change, or merge it with the queued change of the same parameter."""

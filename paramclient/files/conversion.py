@@ -16,7 +16,7 @@ from paramclient.files import json_format, lists
 from paramclient.files.disk import LARGEST_FILE, read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, format_of_name
 from paramclient.files.reading import Reading
-from paramclient.model.identity import autopilot_name, version_text
+from paramclient.model.identity import autopilot_name, check_ids, version_text
 from paramclient.model.names import counted, first_of
 from paramclient.model.notation import time_text
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -298,9 +298,7 @@ def _check(sets: Sequence[ParamSet], file_format: FileFormat) -> None:
         )
     seen = set()
     for each in sets:
-        for number, least in ((each.system, 1), (each.component, 0)):
-            if number is not None and not least <= number <= 255:
-                raise UsageError(f"a system or component has an id from {least} to 255, not {number}")
+        check_ids(each.system, each.component)
         for param in each.values():
             check_name(param.name)
         ids = (each.system, AUTOPILOT if each.component is None else each.component)

@@ -5,16 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import PurePath
-from typing import Final, NoReturn
+from typing import Final
 
-from paramclient.errors import FileError, UsageError
+from paramclient.errors import FileError
+from paramclient.model.notation import NamedChoice
 from paramclient.model.paramset import ParamSet
 
 AUTOPILOT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1: the component of a file that names no component."""
 
 
-class FileFormat(StrEnum):
+class FileFormat(NamedChoice):
     """Formats in which ground stations and autopilots store parameters."""
 
     QGC = "qgc"
@@ -27,10 +28,6 @@ class FileFormat(StrEnum):
     """`param.pck`, the packed file that vehicles serve over MAVFTP."""
     JSON = "json"
     """paramclient's own format: all fields of every parameter, exactly."""
-
-    @classmethod
-    def _missing_(cls, value: object) -> NoReturn:
-        raise UsageError(f"unknown file format {value!r}; the formats are {', '.join(cls)}")
 
 
 class LogFormat(StrEnum):

@@ -65,7 +65,6 @@ async def metadata_of(
     files = _Files(component, kept, progress)
     with component.limited(timeout, f"the metadata of {files.label}"):
         before = component.identity
-        component.core.station.gate.check()
         announced = await request_message(component.node.channel, ComponentMetadata)
         if announced is None or not announced.uri:
             return None

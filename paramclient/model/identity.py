@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from paramclient.errors import UsageError
+
 PX4_SITL_UID: Final = "4954414c44494e4f"
 """The hardware id of PX4's SITL and of `sim:px4` with system id 1 (measured). With system id N, SITL adds
 N - 1 to it and to the first byte of `uid2`, whose other bytes are zero (measured; AUTOPILOT_VERSION in PX4's
@@ -91,6 +93,13 @@ class Identity:
         if self.uid is not None:
             return f"the {autopilot_name(self.autopilot)} {self.uid}"
         return f"a vehicle of type {self.vehicle_type} with {autopilot_name(self.autopilot)}"
+
+
+def check_ids(system: int | None, component: int | None, least: int = 0) -> None:
+    """Raise UsageError for ids that no component has; `least` is the smallest component id."""
+    for number, low in ((system, 1), (component, least)):
+        if number is not None and not low <= number <= 255:
+            raise UsageError(f"system ids are 1 to 255, component ids {least} to 255, not {number}")
 
 
 def is_sitl_uid(uid: str | None) -> bool:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import Final, Literal, TypeAlias
 
 import anyio
 
 from paramclient.errors import NoReply
 from paramclient.model.names import first_of
+from paramclient.model.notation import NamedChoice
 from paramclient.model.paramset import ParamMap
 from paramclient.model.values import Param
 from paramclient.protocol.checksum import is_moving
@@ -40,7 +40,7 @@ LOST: Final = "The component was lost."
 REPLACED: Final = "Another vehicle has taken the address, and its parameters were fetched: {}."
 
 
-class Policy(StrEnum):
+class Policy(NamedChoice):
     """The requests that a fetch may send."""
 
     AUTO = "auto"

@@ -220,7 +220,7 @@ def component_set(component: Component, params: Iterable[Param], source: str) ->
 
     `source` is their origin in words.
     """
-    link = component.client.link
+    link = component.core.link
     return ParamSet(
         {param.name: param for param in params},
         component=component.component,

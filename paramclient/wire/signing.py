@@ -18,6 +18,7 @@ from types import MappingProxyType
 from typing import Final, NoReturn
 
 from paramclient.errors import UsageError
+from paramclient.model.notation import NamedChoice
 
 KEY_LENGTH: Final = 32
 """Bytes of a signing key."""
@@ -125,7 +126,7 @@ class SigningKey:
         raise TypeError("a signing key is not pickled")
 
 
-class SigningPolicy(StrEnum):
+class SigningPolicy(NamedChoice):
     """The received frames that are accepted, where there is a key."""
 
     SIGNED_ONLY = "signed-only"

@@ -450,7 +450,7 @@ def test_the_content_selects_the_format(text: str, source: str, form: str) -> No
 def test_a_given_format_is_not_detected() -> None:
     assert loads(b"A 1", file_format="mission-planner").file_format is FileFormat.MISSION_PLANNER
     assert "vehicle, component" in str(failed("A 1", file_format="qgc"))
-    with pytest.raises(UsageError, match=r"unknown file format 'xml'; the formats are qgc, parm"):
+    with pytest.raises(UsageError, match=r"unknown file format 'xml'; choose one of qgc, parm"):
         loads(b"A 1", file_format="xml")
     with pytest.raises(UsageError, match="give the format in which to write"):
         dumps(params_of(WrittenParam("A", 1)))
@@ -480,7 +480,7 @@ CAMERA = params_of(WrittenParam("A", 1, ParamType.INT8), component=100)
         *(
             ([unreadable], form, problem)
             for unreadable, problem in (
-                (params_of(WrittenParam("A", 1), system=256), "id from 1 to 255, not 256"),
+                (params_of(WrittenParam("A", 1), system=256), "component ids 0 to 255, not 256"),
                 (params_of(WrittenParam("", 1)), "at least one character"),
                 (params_of(WrittenParam("A_VERY_LONG_NAME_", 1)), "a param_id holds 16"),
                 (replace(CAMERA, at=math.inf), "inf is not a valid Unix time in seconds"),
