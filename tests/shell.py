@@ -262,6 +262,26 @@ class Late:
         return self.endpoint.data_to_send()
 
 
+class Eventful(Tap):
+    """An endpoint to which things happen.
+
+    Args:
+        endpoint: the vehicle.
+        events: seconds after the link is opened, and what happens then.
+    """
+
+    def __init__(self, endpoint: Endpoint, *events: tuple[float, Callable[[], object]]) -> None:
+        super().__init__(endpoint)
+        self._events = [*events]
+        self._began = math.inf
+
+    def tick(self, now: float) -> None:
+        super().tick(now)
+        self._began = min(self._began, now)
+        while self._events and now > self._began + self._events[0][0]:
+            self._events.pop(0)[1]()
+
+
 class Radio(Tap):
     """A channel that another station shares: the endpoint and we receive what it sends.
 

@@ -32,6 +32,7 @@ from paramclient.links import Peer, SimLink
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.wire import frames, messages
 from tests.commands import Command, Outcome, Put, in_process, strict
+from tests.shell import Eventful
 
 ROOT = Path(__file__).parents[2]
 URL = "sim:custom"
@@ -399,20 +400,9 @@ def test_a_fetch_that_is_interrupted_ends_cleanly(number: int, code: int, tmp_pa
 def test_ctrl_c_during_a_fetch_says_what_was_received_and_kept(
     command: Command, put: Put, tmp_path: Path, kept: bool
 ) -> None:
-    class Interrupting(PX4Vehicle):
-        """A vehicle that is fetched until the user interrupts it."""
-
-        ends_at: float | None = None
-
-        def tick(self, now: float) -> None:
-            super().tick(now)
-            self.ends_at = self.ends_at or now + 30
-            if now > self.ends_at:
-                self.ends_at = math.inf
-                signal.raise_signal(signal.SIGINT)
-
     cache = ["--cache", tmp_path / "cache"] if kept else ["--no-cache"]
-    done = command("fetch", put(Interrupting(burst=1, period=0.2)), *cache)
+    vehicle = Eventful(PX4Vehicle(burst=1, period=0.2), (30.0, lambda: signal.raise_signal(signal.SIGINT)))
+    done = command("fetch", put(vehicle), *cache)
     assert (done.code, done.out) == (130, "")
     where = "kept in the cache" if kept else "not kept, without a cache"
     found = re.fullmatch(

@@ -9,6 +9,7 @@ import pytest
 
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from tests.commands import Command, Put
+from tests.shell import Eventful
 
 URL = "sim:px4"
 TABLE: dict[str, Any] = {
@@ -67,23 +68,17 @@ def test_fetch_show_history_and_save_take_names_and_patterns(
 
 
 def test_watch_follows_groups_that_appear(command: Command, put: Put) -> None:
-    class Changing(ArduPilotVehicle):
-        """A vehicle on which another program switches a group on, and later off."""
+    """Another program switches a group on, and later off."""
 
-        changes: list[tuple[float, int]] | None = None
-
-        def tick(self, now: float) -> None:
-            super().tick(now)
-            if self.changes is None and self.requests.total():
-                self.changes = [(now + 5.0, 1), (now + 20.0, 0)]
-            if self.changes and now > self.changes[0][0]:
-                self.set_param("GRP_ENABLE", self.changes.pop(0)[1])
-                self.set_param("MC_ROLL_P", now)
+    def switch(on: int) -> None:
+        vehicle.set_param("GRP_ENABLE", on)
+        vehicle.set_param("MC_ROLL_P", 5.0 + on)
 
     table = [SimParam("GRP_ENABLE", 2, 0), SimParam("MC_ROLL_P", 9, 4.0)]
     groups: dict[str, Any] = {"GRP_ENABLE": {"GRP_ONE": 1.0, "GRP_TWO": 2.0}}
-    vehicle = Changing(table=table, groups=groups, live=(), ftp=False)
-    watched = command("watch", put(vehicle), "grp_*", "--timeout", 60)
+    vehicle = ArduPilotVehicle(table=table, groups=groups, live=(), ftp=False)
+    url = put(Eventful(vehicle, (8.0, lambda: switch(1)), (24.0, lambda: switch(0))))
+    watched = command("watch", url, "grp_*", "--timeout", 60)
     assert (watched.code, watched.err) == (0, "watching grp_* of 1/1 ardupilot\n")
     found = [line.partition("  ")[2] for line in watched.out.splitlines()]
     assert sorted(line for line in found if not line.startswith("1/1 resynced")) == [

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import pytest
 from paramclient import read_file
 from paramclient.sim import Air, ArduPilotVehicle, Camera, PX4Vehicle
 from tests.commands import Command, Put, strict
-from tests.shell import Tap
+from tests.shell import Eventful, Tap
 
 URL = "udpin:0.0.0.0:14550"
 TABLE: dict[str, Any] = {"A": 1.0, "B": 2}
@@ -161,20 +161,9 @@ def test_save_writes_every_vehicle_into_one_file_or_into_one_each(
 
 
 def test_watch_prints_the_changes_of_every_vehicle(command: Command, put: Put) -> None:
-    class Changing(PX4Vehicle):
-        """A vehicle that changes a value on its own, 6 s after its first heartbeat."""
-
-        changes_at: float | None = None
-
-        def tick(self, now: float) -> None:
-            super().tick(now)
-            self.changes_at = self.changes_at or now + 6.0
-            if now >= self.changes_at:
-                self.changes_at = math.inf
-                self.set_param("A", 3.0)
-
     def watch(*words: str) -> list[str]:
-        url = put(Air([Changing(table=TABLE), Changing(system=2, table=TABLE)]))
+        vehicles = px4(), px4(2)
+        url = put(Air([Eventful(each, (6.0, partial(each.set_param, "A", 3.0))) for each in vehicles]))
         watched = command("watch", url, "A", "--vehicle", "all", "--timeout", 20, *words)
         assert watched.code == 0, watched.err
         return watched.out.splitlines()

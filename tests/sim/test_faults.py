@@ -10,8 +10,8 @@ from typing import Literal
 import pytest
 
 from paramclient.errors import CommandResult
-from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
-from paramclient.wire import frames, messages
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
+from paramclient.wire import messages
 from tests.ground_station import LIST, Station, indices, names
 
 NO_INDEX = messages.NO_INDEX
@@ -36,14 +36,6 @@ class TestWhenListed:
 
 
 class TestClock:
-    def test_system_time_starts_with_the_vehicle(self) -> None:
-        vehicle = GenericVehicle(table=TEN)
-        station = Station(vehicle, start=100.0).wait(2.5)
-        assert [time.time_boot_ms for time in station.receive(messages.SystemTime)] == [0, 1000, 2000]
-        vehicle.reboot(station.now, down=0.7)
-        times = station.wait(2.0).receive(messages.SystemTime)
-        assert times == [messages.SystemTime(0, 0), messages.SystemTime(0, 1000)]
-
     @pytest.mark.parametrize(("kind", "requested"), [("copter", [True]), ("plane", []), ("rover", [])])
     def test_ardupilot_sends_system_time_when_its_main_loop_runs(
         self, kind: Literal["copter", "plane", "rover"], requested: list[bool]
@@ -63,17 +55,6 @@ class TestClock:
         assert [time.time_boot_ms for time in station.wait(0.2).receive(messages.SystemTime)] == [1400]
         station.send(CLOCK_REQUEST).wait(0.001)
         assert [time.time_boot_ms for time in station.receive(messages.SystemTime)] == [1500]
-
-    def test_px4_sends_the_time_since_boot_with_telemetry(self) -> None:
-        vehicle = PX4Vehicle(table=TEN)
-        vehicle.tick(10.0)
-        vehicle.receive(messages.encode(CLOCK_REQUEST, system=255, component=190, sequence=0), 10.1)
-        for second in (11.0, 12.0, 12.5):
-            vehicle.tick(second)
-        sent = [frame for data in vehicle.data_to_send() for frame in frames.Framer().receive(data)]
-        clocks = [int.from_bytes(frame.payload[:4], "little") for frame in sent if frame.message_id == 30]
-        assert clocks == [300, 1300, 2300]
-        assert messages.message_id(messages.SystemTime) not in {frame.message_id for frame in sent}
 
     @pytest.mark.parametrize(
         ("make", "first", "then"),

@@ -43,18 +43,7 @@ from paramclient.wire.messages import (
     message_id,
 )
 from paramclient.wire.signing import SigningKey
-from tests.recordings import read
-
-RECORDINGS = {
-    "ardupilot_ftp_download": 0,
-    "ardupilot_full_download": 1382,
-    "ardupilot_get_set": 12,
-    "px4_full_download": 907,
-    "px4_get_set": 10,
-    "px4_hash_hit_and_stop": 21,
-    "px4_restart_mid_stream": 1203,
-}
-"""Each with the number of PARAM_VALUEs in it."""
+from tests.recordings import NAMES, read
 
 FRAME_SIZE_MAX = 280
 """Bytes of the longest frame: 10 of header, 255 of payload, 2 of checksum, 13 of signature."""
@@ -307,7 +296,7 @@ def read_by_pymavlink(stream: bytes) -> list[Frame]:
     return frames
 
 
-@pytest.mark.parametrize("name", RECORDINGS)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_recording_gives_the_frames_that_pymavlink_finds(name: str) -> None:
     parts = [record.data for record in read(name)]
     stream = b"".join(parts)
@@ -316,7 +305,6 @@ def test_a_recording_gives_the_frames_that_pymavlink_finds(name: str) -> None:
     datagrams = Framer(stream=False)
     assert [frame for part in parts for frame in datagrams.receive(part)] == expected
     values = [decode(frame) for frame in Framer({22}).receive(stream)]
-    assert len(values) == RECORDINGS[name]
     theirs = [m for m in dialect.MAVLink(None).parse_buffer(stream) if m.get_type() == "PARAM_VALUE"]
     for ours, message in zip(values, theirs, strict=True):
         assert isinstance(ours, ParamValue)
