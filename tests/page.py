@@ -8,6 +8,7 @@ import threading
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -51,32 +52,27 @@ class Limited(ArduPilotVehicle):
         super().respond(clamped(message, "RTL_ALT", 0, HIGHEST), sender)
 
 
+@dataclass
 class Bench:
     """A service in a thread of its own, with its vehicles.
 
     Attributes:
+        portal: to its thread.
         url: where it is.
         endpoint: where ground stations connect.
         vehicles: the vehicles by the name of their link; what is done to them goes through `do`.
         token: what other programs show to the service, where it wants one.
     """
 
-    def __init__(
-        self,
-        portal: anyio.from_thread.BlockingPortal,
-        url: str,
-        endpoint: str,
-        vehicles: Mapping[str, Vehicle],
-    ) -> None:
-        self._portal = portal
-        self.url = url
-        self.endpoint = endpoint
-        self.token = ""
-        self.vehicles = vehicles
+    portal: anyio.from_thread.BlockingPortal
+    url: str
+    endpoint: str
+    vehicles: Mapping[str, Vehicle]
+    token: str = ""
 
     def do(self, call: Callable[..., Result], *arguments: Any) -> Result:
         """Call something where the vehicles are."""
-        return self._portal.call(call, *arguments)
+        return self.portal.call(call, *arguments)
 
     def ask(self, method: str, address: str, body: object = None) -> Any:
         """What another program asks of the service, and is answered."""

@@ -192,7 +192,7 @@ def differences(
         ]
     found = _beats(expected.pop("Heartbeat", []), actual.pop("Heartbeat", []))
     pairs = []
-    requested = _requests(name)
+    requested = requests_in(name)
     for key in sorted(expected.keys() | actual.keys()):
         parts = [(expected[key], actual[key])]
         if key == "list":
@@ -232,7 +232,7 @@ class _Pair(NamedTuple):
 
 def _series(name: str, log: Messages, unasked: Collection[str]) -> defaultdict[str, Messages]:
     """Return the messages by series; index 0 starts a pass if a list was requested since the last pass."""
-    lists = [time for time, request in _requests(name) if isinstance(request, messages.ParamRequestList)]
+    lists = [time for time, request in requests_in(name) if isinstance(request, messages.ParamRequestList)]
     series: defaultdict[str, Messages] = defaultdict(list)
     last, passes = None, 0
     for time, message in log:
@@ -264,7 +264,8 @@ def _passes(values: Messages) -> list[Messages]:
     return passes
 
 
-def _requests(name: str) -> list[tuple[float, messages.Message]]:
+def requests_in(name: str) -> Messages:
+    """Return the requests of the ground station."""
     return [(record.time, message) for record in from_ground(name) if (message := record.message) is not None]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -20,3 +21,10 @@ def flying(endpoint: Endpoint) -> Iterator[str]:
             yield f"udpout:127.0.0.1:{link.address[1]}"
         finally:
             serving.cancel()
+
+
+def free_port() -> int:
+    """A UDP port of this computer that no program uses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

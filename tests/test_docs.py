@@ -6,7 +6,6 @@ import io
 import os
 import re
 import shlex
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from unittest import mock
 import pytest
 
 from paramclient import cli
+from tests.simulated_on_udp import free_port
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -64,7 +64,7 @@ def outputs() -> dict[str, str]:
 
 def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run Python in a folder, with a cache of its own; trailing spaces of the output are cut."""
-    folders = {"XDG_CACHE_HOME": str(cwd), "XDG_STATE_HOME": str(cwd)}
+    folders = dict.fromkeys(("XDG_CACHE_HOME", "XDG_STATE_HOME", "TMPDIR"), str(cwd))
     done = subprocess.run(
         [sys.executable, *arguments],
         cwd=cwd,
@@ -281,22 +281,14 @@ def simulating(vehicle: str, port: int, cwd: Path) -> Iterator[None]:
             process.terminate()
 
 
-@pytest.fixture
-def port() -> int:
-    """Return a UDP port that no program uses."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["index", "json", "metadata", "parameter-files", "vehicles"])
-def test_the_commands_of_a_page_print_what_it_shows(name: str, port: int, tmp_path: Path) -> None:
+def test_the_commands_of_a_page_print_what_it_shows(name: str, tmp_path: Path) -> None:
     """In one folder, in the order of the page; on the first page with its vehicles, on another port.
 
     A command without a text below it prints nothing. Those that find differences exit with 1.
     """
-    text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+    text, port = (DOCS / f"{name}.md").read_text(encoding="utf-8"), free_port()
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     for file, content in FILE_TO_WRITE.findall(text):
         (tmp_path / file).write_text(content, encoding="utf-8")
@@ -314,8 +306,8 @@ def test_the_commands_of_a_page_print_what_it_shows(name: str, port: int, tmp_pa
 
 
 @pytest.mark.slow
-def test_the_program_for_sitl_runs(port: int, tmp_path: Path) -> None:
+def test_the_program_for_sitl_runs(tmp_path: Path) -> None:
     """With a simulated vehicle over UDP, on another port."""
     [program] = [code for code in blocks(DOCS / "testing.md", "python") if SITL in code]
-    with simulating("px4", port, tmp_path):
+    with simulating("px4", port := free_port(), tmp_path):
         run_program(program.replace("14550", str(port)), tmp_path)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.test_docs import run
+
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parent.parent
-EXAMPLES = ROOT / "examples"
+EXAMPLES = Path(__file__).parent.parent / "examples"
 
 PRINTED = {
     "companion": [
@@ -70,23 +68,6 @@ PRINTED = {
 }
 
 
-def run(*command: str | Path, cache: Path) -> str:
-    """Run a Python program with a cache of its own; what it printed. A warning would be an error."""
-    done = subprocess.run(
-        [sys.executable, "-W", "error", *command],
-        env=os.environ
-        | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cache), "TMPDIR": str(cache)}
-        | {"COLUMNS": "80"},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        encoding="utf-8",
-        timeout=60,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout
-
-
 def test_every_example_is_tested() -> None:
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(PRINTED)
 
@@ -95,7 +76,8 @@ def test_every_example_is_tested() -> None:
 def test_runs(name: str, tmp_path: Path) -> None:
     if name == "companion" and shutil.which("curl") is None:
         pytest.skip("its shell script needs curl, which is not installed here")
-    printed = run(EXAMPLES / f"{name}.py", cache=tmp_path)
+    done = run("-W", "error", str(EXAMPLES / f"{name}.py"), cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
     for line in PRINTED[name]:
-        assert re.search(line, printed), f"{line!r} is not in\n{printed}"
-    assert "\x1b" not in printed
+        assert re.search(line, done.stdout), f"{line!r} is not in\n{done.stdout}"
+    assert "\x1b" not in done.stdout

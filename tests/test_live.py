@@ -69,10 +69,7 @@ EVERYWHERE = (
 )
 OF_A_KIND = {
     "px4": ("fetch in a new session, cached",),
-    "ardupilot": (
-        *("set, a fraction for an integer", "apply, a group that is hidden"),
-        "fetch by list, 5% loss, 100 ms",
-    ),
+    "ardupilot": (*("set, a fraction for an integer", "fetch by list, 5% loss, 100 ms"),),
 }
 SEEN = {"px4": "from the cache", "ardupilot": "GRIP_ENABLE: {0}, {1}, {0} parameters"}
 

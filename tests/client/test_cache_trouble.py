@@ -56,19 +56,13 @@ HOUR = 3600.0
 DAY = 24 * HOUR
 
 
-class Wall:
-    """The time of day that the cache uses: it goes on with the clock of the loop, and can be set."""
-
-    @property
-    def now(self) -> float:
-        return simulated_time_loop().now + simulated_time_loop().ahead
-
-    @now.setter
-    def now(self, at: float) -> None:
-        simulated_time_loop().ahead = at - simulated_time_loop().now
+def time_of_day() -> float:
+    """Seconds as the cache has them: they go on with the clock of the loop."""
+    return simulated_time_loop().now + simulated_time_loop().ahead
 
 
-WALL = Wall()
+def set_clock(at: float) -> None:
+    simulated_time_loop().ahead = at - simulated_time_loop().now
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -87,12 +81,12 @@ async def test_values_written_late_keep_their_times_and_the_whole_history(
         with unwritable(path):
             await anyio.sleep(5.0)
             await component.fetch_all()
-            fetched_at = WALL.now
+            fetched_at = time_of_day()
             changes, received = component.changes(), []
             for value in (5.0, 6.0, 7.0):
                 vehicle.set_param(NAME, value)
                 await anext(changes)
-                received.append(WALL.now)
+                received.append(time_of_day())
                 await anyio.sleep(10)
         await anyio.sleep(2 * cache_writer.RETRY_INTERVAL + cache_writer.FLUSH_INTERVAL)
         with ParamCache(path) as cache:
@@ -240,25 +234,25 @@ async def test_a_durable_apply_ends_on_the_disk(tmp_path: Path) -> None:
 @pytest.mark.parametrize("step", [-HOUR, -DAY, HOUR, 400 * DAY])
 async def test_a_step_of_the_clock_changes_only_recorded_times(path: Path, step: float) -> None:
     tap = Tap(vehicle := small_px4())
-    WALL.now = 1_800_000_000.0
+    set_clock(1_800_000_000.0)
     set_at: list[float] = []
 
     async def write(value: int) -> None:
         await component.set("PARAM_01", value)
-        set_at.append(WALL.now)
+        set_at.append(time_of_day())
 
     async with fetched(tap, cache=path) as (_, component):
         await anyio.sleep(2.0)
         await write(10)
         await anyio.sleep(2.0)
         tap.received.clear()
-        WALL.now += step
+        simulated_time_loop().ahead += step
         await anyio.sleep(5.0)
         assert len(tap.received) <= 6, "our heartbeats"
         assert component.params["PARAM_02"].trust is Trust.LIVE
         await write(20)
         await anyio.sleep(2.0)
-        WALL.now -= step
+        simulated_time_loop().ahead -= step
         await write(30)
     with ParamCache(path) as cache:
         table = cache.component(system=1)
@@ -268,7 +262,7 @@ async def test_a_step_of_the_clock_changes_only_recorded_times(path: Path, step:
         assert [line.at for line in lines] == pytest.approx(sorted(set_at), abs=0.001)
         assert table.heard_at["PARAM_01"] == pytest.approx(set_at[-1], abs=0.05), "it is received once more"
         assert bits(table.params) == bits(vehicle.params)
-    WALL.now += step
+    simulated_time_loop().ahead += step
     async with ParamClient(vehicle, cache=path) as client:
         result = await (await client.component()).fetch_all()
         assert result.source == "cache", "the hash says so, whatever the clock says"
@@ -278,13 +272,13 @@ async def test_a_step_of_the_clock_changes_only_recorded_times(path: Path, step:
 async def test_a_clock_that_cannot_be_costs_a_warning_and_nothing_is_lost(
     path: Path, wrong: float, caplog: pytest.LogCaptureFixture
 ) -> None:
-    vehicle, right = small_px4(), WALL.now
+    vehicle, right = small_px4(), time_of_day()
     async with ParamClient(vehicle, cache=path) as client:
-        WALL.now = wrong
+        set_clock(wrong)
         component = await client.component()
         assert (await component.fetch_all()).complete
         await anyio.sleep(1.0)
-        WALL.now = right
+        set_clock(right)
         await anyio.sleep(cache_writer.RETRY_INTERVAL + 1.0)
     [warning] = warnings(caplog)
     assert warning.startswith("continuing without the cache: ")

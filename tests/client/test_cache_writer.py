@@ -26,7 +26,7 @@ from paramclient.model.paramset import ParamSet
 from paramclient.model.values import ParamType
 from paramclient.provision import apply
 from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, PX4Vehicle, SimParam
-from paramclient.wire import frames, messages
+from paramclient.wire import messages
 from tests.caches import read_only
 from tests.client.conftest import connected, fetched, table_in
 from tests.conversations.virtual import Tap as Filter
@@ -154,17 +154,11 @@ async def test_a_change_between_two_sessions_is_a_cache_miss(path: Path) -> None
     assert (await session(vehicle, path)).source == "cache"
 
 
-class Reticent(PX4Vehicle):
-    """It can ignore messages of some kinds."""
-
-    unanswered: tuple[type[messages.Message], ...] = ()
-
-    def respond(self, message: messages.Message, sender: frames.Frame) -> None:
-        if not isinstance(message, self.unanswered):
-            super().respond(message, sender)
-
-
 # Who it is
+
+
+def is_no_command(message: messages.Message) -> bool:
+    return not isinstance(message, messages.CommandLong)
 
 
 @pytest.mark.parametrize("known", [False, True])
@@ -195,9 +189,9 @@ async def test_another_vehicle_takes_the_place_within_a_session(path: Path, know
 
 
 async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
-    vehicle = Reticent(table=VALUES)
-    vehicle.unanswered = (messages.CommandLong,)
-    async with ParamClient(vehicle, cache=path) as client:
+    vehicle = PX4Vehicle(table=VALUES)
+    link = Filter(vehicle, up=is_no_command)
+    async with ParamClient(link, cache=path) as client:
         began = anyio.current_time()
         component = await client.component()
         assert anyio.current_time() - began < 0.01, "nothing is cached that could be waited for"
@@ -206,7 +200,7 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
         assert component.identity.uid is None
     assert kept(path) == bits(vehicle.params), "kept under its system id and link"
     vehicle.reboot(anyio.current_time())
-    async with ParamClient(vehicle, cache=path) as client:
+    async with ParamClient(link, cache=path) as client:
         began = anyio.current_time()
         component = await client.component(timeout=0.5)
         assert not component.params, "not yet"
@@ -216,7 +210,7 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
         assert bits(component.params) == bits(vehicle.params)
         assert (await component.fetch_all()).complete
     vehicle.reboot(anyio.current_time())
-    async with ParamClient(vehicle, cache=path) as client:
+    async with ParamClient(link, cache=path) as client:
         waiting = asyncio.create_task(outcome(client.component()))
         await asyncio.sleep(0.1)
     await settled()
@@ -226,9 +220,9 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
 @pytest.mark.parametrize("fetched", [True, False])
 async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetched: bool) -> None:
     await session(PX4Vehicle(table=VALUES), path)
-    changed = Reticent(table={**VALUES, "PARAM_01": 99}, not_in_use=["PARAM_02"])
-    changed.unanswered = (messages.CommandLong,)
-    tap = Tap(changed)
+    changed = PX4Vehicle(table={**VALUES, "PARAM_01": 99}, not_in_use=["PARAM_02"])
+    link = Filter(changed, up=is_no_command)
+    tap = Tap(link)
     async with connected(tap, cache=path) as (_, component):
         if fetched:
             assert (await component.fetch_all()).complete
@@ -236,7 +230,7 @@ async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetche
             await component.get("PARAM_01")
         await asyncio.sleep(10.0)
         assert component.identity.key.startswith("system:1@")
-        changed.unanswered = ()
+        link.up = lambda message: True
         tap.is_mute = True
         await asyncio.sleep(6.0)
         tap.is_mute = False

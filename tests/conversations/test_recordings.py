@@ -17,7 +17,7 @@ from paramclient.protocol.writes import write
 from paramclient.sim import SimParam, ardupilot_table, px4_table
 from paramclient.wire import messages
 from tests.conversations.virtual import Puppet, talking
-from tests.recordings import NAMES, answers, from_ground, from_vehicle, param_values
+from tests.recordings import NAMES, answers, from_vehicle, param_values, requests_in
 from tests.recordings import read as records_of
 
 PX4_HASH = 0xCF579589
@@ -26,11 +26,6 @@ PX4_HASH = 0xCF579589
 def key(request: messages.Message) -> Hashable:
     """Return what equal requests have in common."""
     return type(request), *(getattr(request, name, None) for name in ("param_id", "param_index", "raw"))
-
-
-def requests_in(name: str) -> list[tuple[float, messages.Message]]:
-    """Return the requests of a recording."""
-    return [(each.time, each.message) for each in from_ground(name) if each.message is not None]
 
 
 class Recorded(Puppet):

@@ -15,12 +15,12 @@ import anyio
 
 from paramclient import Component, FetchResult, ParamClient
 from paramclient.errors import Refused, UnknownParameter, UsageError, ValueNotApplied
-from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Param, ParamType
+from paramclient.model.paramset import ParamSet
+from paramclient.model.values import ParamType
 from paramclient.protocol.commands import SAVING_TIME
-from paramclient.provision import ApplyStatus, apply, restore
+from paramclient.provision import ApplyStatus, restore
 from tests.live.choice import Choice, another_value
-from tests.live.journal import Journal, check_disarmed
+from tests.live.journal import Journal
 from tests.live.relay import CLEAN, Conditions, Relay
 
 T = TypeVar("T")
@@ -317,32 +317,6 @@ async def set_many(session: Session, *, number: int = 30) -> str:
     return f"{len(names)} in {seconds:.2f} s"
 
 
-@dataclass(frozen=True)
-class Group:
-    """A group of parameters that its switch shows, which is off again.
-
-    Attributes:
-        whole, shown: what was fetched without and with the group.
-        members: its parameters.
-    """
-
-    switch: str
-    whole: FetchResult
-    shown: FetchResult
-    members: list[Param]
-
-
-async def groups_of(session: Session, vehicle: Component) -> AsyncIterator[Group]:
-    """Give the groups that the vehicle shows, one after the other."""
-    whole = await vehicle.fetch_all(timeout=SLOWEST_FETCH)
-    for switch in session.choice.groups:
-        await session.journal.set(vehicle, switch, 1)
-        shown = await vehicle.fetch_all(refresh=True, timeout=SLOWEST_FETCH)
-        await session.put_back(vehicle)
-        if names := sorted(shown.params.keys() - whole.params.keys()):
-            yield Group(switch, whole, shown, [shown.params[name] for name in names])
-
-
 @check(
     "a group shown and hidden",
     "its members appear and disappear with the switch",
@@ -351,43 +325,19 @@ async def groups_of(session: Session, vehicle: Component) -> AsyncIterator[Group
 )
 async def show_group(session: Session) -> str:
     async with session.client() as vehicle:
-        async for group in groups_of(session, vehicle):
-            hidden = await vehicle.fetch_all(refresh=True, timeout=SLOWEST_FETCH)
-            counts = [group.whole.count, group.shown.count, hidden.count]
-            if counts != [counts[0], counts[0] + len(group.members), counts[0]]:
-                raise CheckFailed(
-                    f"{group.switch} shows {len(group.members)}, and the vehicle counts {counts}"
-                )
-            await session.check_fetched(vehicle, hidden)
-            return f"{group.switch}: {', '.join(map(str, counts))} parameters"
-    raise Skip(f"none of these shows a group: {', '.join(session.choice.groups) or 'no switch is off'}")
-
-
-@check(
-    "apply, a group that is hidden",
-    "the switch and its members in one run",
-    writes=True,
-    kinds=("ardupilot",),
-)
-async def apply_hidden(session: Session) -> str:
-    async with session.client() as vehicle:
-        async for group in groups_of(session, vehicle):
-            floats = [each for each in group.members if each.type == ParamType.REAL32 and not each.is_raw]
-            if not floats:
-                continue
-            member, switch = floats[0], group.whole.params[group.switch]
-            session.journal.note({switch.name: switch, member.name: member})
-            await check_disarmed(vehicle)
-            values = {switch.name: 1, member.name: another_value(member)}
-            wanted = ParamSet({name: WrittenParam(name, value) for name, value in values.items()})
-            done = await apply(vehicle, wanted)
-            back = await restore(vehicle, done.before)
+        whole = await vehicle.fetch_all(timeout=SLOWEST_FETCH)
+        for switch in session.choice.groups:
+            await session.journal.set(vehicle, switch, 1)
+            shown = await vehicle.fetch_all(refresh=True, timeout=SLOWEST_FETCH)
             await session.put_back(vehicle)
-            for result in (done, back):
-                if not result.complete or result.counts[ApplyStatus.ACCEPTED] != len(values):
-                    raise CheckFailed(f"{result}: {'; '.join(map(str, result.shown_rows))}")
-            return f"{switch.name} and {member.name} in {done.elapsed:.2f} s"
-    raise Skip("no switch of a group with a float is off")
+            if members := shown.params.keys() - whole.params.keys():
+                hidden = await vehicle.fetch_all(refresh=True, timeout=SLOWEST_FETCH)
+                counts = [whole.count, shown.count, hidden.count]
+                if counts != [counts[0], counts[0] + len(members), counts[0]]:
+                    raise CheckFailed(f"{switch} shows {len(members)}, and the vehicle counts {counts}")
+                await session.check_fetched(vehicle, hidden)
+                return f"{switch}: {', '.join(map(str, counts))} parameters"
+    raise Skip(f"none of these shows a group: {', '.join(session.choice.groups) or 'no switch is off'}")
 
 
 @check(

@@ -96,7 +96,6 @@ def another_value(param: Param) -> int | float:
     value = param.value
     assert isinstance(value, int | float)
     assert not param.is_raw
-    assert isinstance(value, int | float)
     is_upper_bound = param.name.endswith(("_MAX", "_BRIGHT", "_BUFSIZE")) and value >= 1
     other = from_bits(bits_of(value - 1 if is_upper_bound else value + 1, param.type), param.type)
     assert isinstance(other, int | float)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import anyio
@@ -22,14 +22,6 @@ from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
 from tests.shell import PeersLink, a_client
 
 T = TypeVar("T")
-
-
-def free_port() -> int:
-    """A UDP port of this computer that no program uses."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-    return port
 
 
 class StationsLink(PeersLink):
@@ -170,6 +162,7 @@ class _Behind:
         return data
 
 
+@dataclass
 class Served:
     """A gateway over the links of some vehicles, with ground stations.
 
@@ -177,10 +170,9 @@ class Served:
         gateway, clients, link: the parts.
     """
 
-    def __init__(self, gateway: Gateway, clients: list[ParamClient], link: StationsLink) -> None:
-        self.gateway = gateway
-        self.clients = clients
-        self.link = link
+    gateway: Gateway
+    clients: list[ParamClient]
+    link: StationsLink
 
     def partner(self, **options: Any) -> Partner:
         """A new ground station; it is known from its first frame on."""

@@ -7,11 +7,10 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
-import anyio
 import pytest
 
 from paramclient.errors import UsageError
-from paramclient.service import Hub, Tokens, add_token, create_app, read_tokens, serve
+from paramclient.service import Tokens, add_token, create_app, read_tokens
 from tests.service.hub import V, browsing, problem, service, synced
 from tests.shell import VALUES, generic
 
@@ -174,17 +173,6 @@ async def test_responses_cannot_be_framed_cached_or_taken_for_another_type() -> 
             assert "frame-ancestors 'none'" in headers["content-security-policy"]
             assert headers["x-content-type-options"] == "nosniff"
             assert headers["cache-control"] == "no-store"
-
-
-OTHERS = ["0.0.0.0:0", "[::]:0", "192.0.2.1:0", "station.example:0"]
-INVALID = ["127.0.0.1", ":80", "::1:80", "[::1]", "host:", "host:x", "host:70000"]
-
-
-@pytest.mark.parametrize("address", [*OTHERS, *INVALID])
-@pytest.mark.asyncio
-async def test_other_computers_need_tokens_and_an_address_host_and_port(address: str) -> None:
-    with pytest.raises(UsageError, match="--tokens" if address in OTHERS else "HOST:PORT"):
-        await serve(Hub([], cache=False), address, stop=anyio.Event(), listens=print)
 
 
 def test_a_token_file_is_private_and_holds_digests(tmp_path: Path) -> None:

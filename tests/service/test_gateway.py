@@ -13,7 +13,7 @@ import tracemalloc
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import anyio
 import fastcrc
@@ -47,10 +47,12 @@ from paramclient.wire.messages import (
 )
 from paramclient.wire.signing import SigningKey
 from tests.conversations.virtual import Puppet
+from tests.ground_station import Station as GroundStation
 from tests.service.ground_stations import Partner, Served, StationsLink, gateway_over
 from tests.service.hub import V, browsing
 from tests.shell import PeersLink, Radio, Tap, a_client, bits, generic, small_px4, until
 
+T = TypeVar("T")
 LIST = ParamRequestList(1, 1)
 REQUESTS = (ParamRequestList, ParamRequestRead, ParamSet)
 GCS = Heartbeat(6, 8)
@@ -178,17 +180,9 @@ async def test_rule_1_a_list_that_was_asked_before_the_vehicle_was_heard_is_answ
 # 2: answered from the table
 
 
-def directly(vehicle: Endpoint, *requests: messages.Message, seconds: float = 4.0) -> list[messages.Message]:
-    """What a vehicle answers to a station that is connected to it."""
-    framer, found, now = frames.Framer(messages.DECODED_IDS, stream=False), [], 0.0
-    vehicle.tick(now)
-    for sequence, request in enumerate(requests):
-        vehicle.receive(messages.encode(request, system=255, component=190, sequence=sequence), now)
-    while now < seconds:
-        now += 0.01
-        vehicle.tick(now)
-        found += [messages.decode(each) for data in vehicle.data_to_send() for each in framer.receive(data)]
-    return [each for each in found if each is not None]
+def answers_of(vehicle: Endpoint, kind: type[T], *requests: messages.Message) -> list[T]:
+    """The answers of a kind by a vehicle to a station that is connected to it."""
+    return GroundStation(vehicle).send(*requests).wait(4.0).receive(kind)
 
 
 @pytest.mark.parametrize("kind", [PX4Vehicle, ArduPilotVehicle, generic])
@@ -196,7 +190,7 @@ async def test_rule_2_lists_and_reads_have_the_bytes_of_the_vehicle(kind: Callab
     name = kind().listed[2].name
     async with in_sync(kind()) as (_, vehicle, station):
         for request in (LIST, ParamRequestRead(1, 1, name, -1), ParamRequestRead(1, 1, "", 1)):
-            wanted = [each for each in directly(kind(), request) if isinstance(each, ParamValue)]
+            wanted = answers_of(kind(), ParamValue, request)
             await station.ask(request)
             assert station.of(ParamValue) == wanted
         assert not requested(vehicle)
@@ -238,9 +232,7 @@ async def test_rule_2_an_unknown_name_is_known_to_be_unknown_in_3_seconds_also_w
 
 async def test_rule_2_extended_parameters() -> None:
     camera = Tap(Camera())
-    wanted = [
-        each for each in directly(Camera(), ParamExtRequestList(1, 100)) if isinstance(each, ParamExtValue)
-    ]
+    wanted = answers_of(Camera(), ParamExtValue, ParamExtRequestList(1, 100))
     async with gateway_over(camera) as served:
         await served.clients[0].component(1, 100)
         station = served.partner()
@@ -267,8 +259,9 @@ def direct_file(path: str, size: int) -> bytes:
         Packet(1, 0, Opcode.OPEN_FILE_RO, path.encode()),
         Packet(3, 0, Opcode.BURST_READ_FILE, size=size),
     ]
-    said = directly(ArduPilotVehicle(), *(FileTransfer(0, 1, 1, each.pack()) for each in requests))
-    return content_of([Packet.unpack(each.payload) for each in said if isinstance(each, FileTransfer)][1:])
+    sent = (FileTransfer(0, 1, 1, each.pack()) for each in requests)
+    _, *said = answers_of(ArduPilotVehicle(), FileTransfer, *sent)
+    return content_of([Packet.unpack(each.payload) for each in said])
 
 
 def content_of(packets: list[Packet]) -> bytes:
@@ -327,7 +320,7 @@ async def test_rule_2_the_checksum_of_the_parameter_file(query: bytes) -> None:
     """The vehicle may send a default that is the value, which the table does not keep."""
     data = b"@PARAM/param.pck" + query
     request = FileTransfer(0, 1, 1, Packet(1, 0, Opcode.CALC_FILE_CRC32, data).pack())
-    [wanted] = [each for each in directly(ArduPilotVehicle(), request) if isinstance(each, FileTransfer)]
+    [wanted] = answers_of(ArduPilotVehicle(), FileTransfer, request)
     async with in_sync(ArduPilotVehicle()) as (_, vehicle, station):
         assert await station.ask_file(Opcode.CALC_FILE_CRC32, data=data) == [Packet.unpack(wanted.payload)]
         assert bool(vehicle.messages(FileTransfer)) == bool(query)

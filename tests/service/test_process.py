@@ -90,10 +90,15 @@ async def test_it_wants_a_token_of_its_file(tmp_path: Path) -> None:
         await synced(browser)
 
 
+OTHERS = ["0.0.0.0:0", "[::]:0", "192.0.2.1:0", "station.example:0"]
+INVALID = ["127.0.0.1", ":80", "::1:80", "[::1]", "host:", "host:x", "host:70000"]
+
+
 @pytest.mark.parametrize(
     ("code", "words", "said"),
     [
-        (2, ["sim:px4", "--listen", "0.0.0.0:0"], "--tokens"),
+        *((2, ["sim:px4", "--listen", address], "--tokens") for address in OTHERS),
+        *((2, ["sim:px4", "--listen", address], "HOST:PORT") for address in INVALID),
         (2, ["sim:px4", "--tokens", "no-such-file"], "no-such-file"),
         (2, ["sim:px4", "--cache", "a", "--no-cache"], "exclusive"),
         (2, ["sim:px4", "sim:px4"], "twice"),

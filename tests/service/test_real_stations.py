@@ -20,8 +20,8 @@ from paramclient.model.values import Encoding, decode_value
 from paramclient.service import Hub
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.wire.messages import ParamRequestList, ParamRequestRead, ParamSet
-from tests.service.ground_stations import free_port
 from tests.shell import TIMEOUT, Tap, small_px4, until
+from tests.simulated_on_udp import free_port
 
 
 def fetch_with_pymavlink(port: int) -> dict[str, float]:
