@@ -21,6 +21,8 @@ _LENGTH: Final = r"([0-9]{1,9}(?:\.[0-9]{1,9})?) ?(s|sec|second|m|min|minute|h|h
 """A number with a unit, such as `30min`."""
 _AGO: Final = re.compile(rf"{_LENGTH}(?: ?{_LENGTH})*(?: ago)?", re.ASCII)
 """A time before now, such as `2h 30min ago`."""
+SNAPSHOT_DIGITS_MAX: Final = 18
+"""Digits of the number of a snapshot; a longer text is a time, if anything."""
 _MOMENT: Final = re.compile(
     r"(?:(?P<day>today|yesterday|[0-9]{4}-[0-9]{2}-[0-9]{2})(?:[t ](?=.)|$))?"
     r"(?:(?P<hour>[0-9]{1,2})(?P<minutes>:[0-9]{2}(?::[0-9]{2}(?:\.[0-9]{1,6})?)?)"
@@ -28,6 +30,12 @@ _MOMENT: Final = re.compile(
     re.ASCII,
 )
 """A day, a time of day, or both, with or without a time zone."""
+
+
+def parse_moment(text: str, now: float) -> float | int:
+    """Return the time in a text as `parse_time`, or the number of a snapshot, as `state_at` takes them."""
+    is_number = text.isdecimal() and len(text) <= SNAPSHOT_DIGITS_MAX
+    return int(text) if is_number else parse_time(text, now)
 
 
 def parse_time(text: str, now: float, zone: tzinfo | None = None) -> float:

@@ -15,7 +15,7 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient import errors
-from paramclient.cache.moments import parse_time
+from paramclient.cache.moments import parse_moment
 from paramclient.cli.json_output import JsonObject, apply_json, plan_json, row_json, rows_json
 from paramclient.cli.metadata import MetadataChoice, default_in, known_of_session, no_defaults, say_sources
 from paramclient.cli.options import ApplyFlags
@@ -38,8 +38,6 @@ _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be reve
 """Words for planned actions in the summary, where they differ from the status."""
 _INCLUDABLE: Final = frozenset(CATEGORIES) - {READ_ONLY}
 """Categories of left-out parameters that --include writes; the vehicle lets no client write the others."""
-SNAPSHOT_DIGITS_MAX: Final = 18
-"""Digits of the number of a snapshot; all other texts are times."""
 _OPTIONS: Final = ApplyFlags()
 
 
@@ -115,17 +113,13 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
             --snapshots`; or a backup file. Default: the state before the last apply, unless a restore ran
             since then. With --vehicle all, a time, or a backup file with {uid} or {system} in its name.
     """
-    if when is None:
-        return await _run(url, options, bind(_earlier_state, None))
-    number = int(when) if when.isdecimal() and len(when) <= SNAPSHOT_DIGITS_MAX else None
-    if (number or is_file(when)) and ChosenVehicle.parse(options.vehicle).is_all:
-        hint = "with --vehicle all, give a time, or a file with {uid} or {system} in its name"
-        raise errors.UsageError(f"{when} is the state of one vehicle; {hint}")
-    if is_file(when) or is_pattern_name(when):
-        load, options = await _from_file(when, options, is_restore=True)
-        return await _run(url, options, load)
-    moment = parse_time(when, time.time()) if number is None else number
-    return await _run(url, options, bind(_earlier_state, moment))
+    if when is None or not (is_file(when) or is_pattern_name(when)):
+        moment = None if when is None else parse_moment(when, time.time())
+        return await _run(url, options, bind(_earlier_state, moment))
+    if ChosenVehicle.parse(options.vehicle).is_all and not is_pattern_name(when):
+        raise errors.UsageError("with --vehicle all, the backup file needs {uid} or {system} in its name")
+    load, options = await _from_file(when, options, is_restore=True)
+    return await _run(url, options, load)
 
 
 async def reset(
@@ -214,8 +208,6 @@ async def _earlier_state(moment: float | int | None, session: CommandSession) ->
             return State(await anyio.to_thread.run_sync(read), is_restore=True)
         find = bind(load_restore_point, cache, *place, extended=extended)
         point = await anyio.to_thread.run_sync(find)
-    except errors.NotInCache:
-        raise
     except (errors.CacheError, errors.UnknownVehicle) as error:  # the user named no vehicle of the cache
         problem = f"nothing was sent, as no earlier state can be read: {error}"
         hint = "A backup file can be restored without the cache (--no-cache)"
@@ -403,7 +395,7 @@ class _Job:
         is_part = self.state.is_part or not all(row.is_as_wanted for row in done)
         code = ExitCode.INCOMPLETE if is_part else ExitCode.DONE
         if isinstance(found, Plan):
-            made, end, late = found, "; nothing was sent", found.reboot_for
+            made, end, late = found, "; nothing was sent", found.reboot_for + found.awaiting_reboot
             if session.component.is_armed and not options["allow_armed"]:
                 remarks.append("armed; nothing would be set now without --allow-armed")
                 code = ExitCode.INCOMPLETE
@@ -411,9 +403,6 @@ class _Job:
                 remarks.append(f"nothing would be sent without --partial: {listed([*found.problems])}")
                 code = ExitCode.USAGE
             remarks.append(found.firmware_note)
-            if options["reboot"] and (reboot_for := late + found.awaiting_reboot):
-                remarks.append(f"reboots for: {listed(reboot_for)}")
-                late = ()
         elif isinstance(found, ApplyResult):
             made, end, late = found.plan, f" in {found.elapsed:.1f} s", found.reboot_required
             if found.system != session.component.system:

@@ -174,7 +174,7 @@ def test_dry_run_prints_the_stages_in_order(command: Command, put: Put, file: Fi
     assert outcome.code == 0
     purpose = "switches that reveal parameters, takes effect after a reboot"
     assert outcome.rows[1] == ["EK2_ENABLE", "0", "1", "set", purpose]
-    assert "1/1 ardupilot: reboots for: EK2_ENABLE\n" in outcome.err
+    assert "1/1 ardupilot: takes effect after a reboot: EK2_ENABLE\n" in outcome.err
     names = [row[0] for row in outcome.rows[2:]]
     assert names == ["RTL_ALT", "WPNAV_SPEED", "COMPASS_OFS_X", "EK2_NO_SUCH"]
     assert "; nothing was sent\n" in outcome.err
@@ -356,7 +356,6 @@ def test_one_file_or_state_for_all_vehicles_is_refused(
         (["apply", tmp_path / "{system}.param"], "2.param: no such file"),
         (["apply", file(), "--vehicle", 2], "vehicle"),
         (["restore", file()], "{uid} or {system} in its name"),
-        (["restore", 1], "1 is the state of one vehicle"),
         (["restore", "--backup", "same.json"], "{uid} or {system}"),
         (["restore", "--no-cache"], "in the cache, which is not used"),
         (["restore", tmp_path / "none-{system}.param"], "no such file"),
