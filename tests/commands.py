@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
 import anyio
@@ -76,6 +77,14 @@ def in_process(capsys: pytest.CaptureFixture[str], *cache: str) -> Command:
         return Outcome(code, printed.out, printed.err)
 
     return call
+
+
+def metadata_file(folder: Path, **fields: dict[str, object]) -> Path:
+    """Write metadata as PX4 has it, with these fields of each parameter; the type is Float unless given."""
+    path = folder / "parameters.json"
+    entries = [{"name": name, "type": "Float"} | each for name, each in fields.items()]
+    path.write_text(json.dumps({"version": 1, "parameters": entries}), encoding="utf-8")
+    return path
 
 
 def behind(monkeypatch: pytest.MonkeyPatch, url: str) -> Put:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import signal
 from collections.abc import Callable
@@ -14,7 +13,7 @@ import pytest
 from paramclient import Encoding, ParamType, read_file
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle
 from paramclient.wire import frames, messages
-from tests.commands import Command, Put
+from tests.commands import Command, Put, metadata_file
 from tests.conversations.partial import Partial
 
 TABLE: dict[str, Any] = {
@@ -437,13 +436,10 @@ def test_an_interrupted_restore_is_continued_by_its_number(command: Command, put
 # Metadata
 
 
-def test_metadata_gives_ranges_and_reboots(command: Command, put: Put, file: File) -> None:
+def test_metadata_gives_ranges_and_reboots(command: Command, put: Put, file: File, tmp_path: Path) -> None:
     vehicle = copter()
-    described = [
-        {"name": "RTL_ALT", "type": "Int32", "min": 30, "max": 2000},
-        {"name": "WPNAV_SPEED", "type": "Float", "rebootRequired": True},
-    ]
-    metadata = file(json.dumps({"version": 1, "parameters": described}), "parameters.json")
+    ranges = {"type": "Int32", "min": 30, "max": 2000}
+    metadata = metadata_file(tmp_path, RTL_ALT=ranges, WPNAV_SPEED={"rebootRequired": True})
     outcome = command("apply", put(vehicle), file(), "--metadata", metadata)
     assert outcome.code == 2
     assert "RTL_ALT: 2500 is above the maximum of 2000" in outcome.err

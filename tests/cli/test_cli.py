@@ -267,16 +267,10 @@ def test_watch_prints_events_of_the_vehicle(command: Command, put: Put) -> None:
 
 
 def test_a_link_that_fails_during_watch_is_reported_once(command: Command, put: Put) -> None:
-    class Failing(SimLink):
-        received = 0
+    def fail() -> None:
+        raise LinkError("it is gone", link=URL)
 
-        async def receive(self) -> list[tuple[Peer, bytes]]:
-            self.received += 1
-            if self.received > 6:
-                raise LinkError("it is gone", link=self.name)
-            return await super().receive()
-
-    url = put(Failing(PX4Vehicle(table={"A": 1}), "sim:custom"))
+    url = put(Eventful(PX4Vehicle(table={"A": 1}), (9.0, fail)))
     watched = command("watch", url, "A", "--no-cache")
     assert (watched.code, watched.out) == (4, "")
     assert watched.err == "watching A of 1/1 px4\nparamclient: it is gone\n"

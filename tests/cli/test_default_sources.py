@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from paramclient.files import read_file
 from paramclient.sim import PX4Vehicle
 from paramclient.wire import messages
-from tests.commands import Command, Put
+from tests.commands import Command, Put, metadata_file
 from tests.shell import Tap
 
 TABLE = {"COM_FLTMODE1": 0, "EKF2_GPS_CTRL": 7, "MC_PITCH_P": 6.5, "MC_ROLL_P": 4.0}
@@ -21,14 +20,6 @@ def quad(*, metadata: bool = True, **options: Any) -> PX4Vehicle:
     vehicle = PX4Vehicle(table=TABLE, metadata=metadata, **options)
     vehicle.set_param("MC_ROLL_P", 6.25)
     return vehicle
-
-
-def a_file(folder: Path, **defaults: float) -> Path:
-    """A file of metadata with these defaults of floats."""
-    path = folder / "parameters.json"
-    entries = [{"name": name, "type": "Float", "default": value} for name, value in defaults.items()]
-    path.write_text(json.dumps({"version": 1, "parameters": entries}))
-    return path
 
 
 ROW = ["MC_ROLL_P", "6.25", "REAL32", "3", "live", "4.0"]
@@ -86,7 +77,7 @@ def test_save_writes_what_differs(command: Command, put: Put, tmp_path: Path) ->
     assert written["MC_ROLL_P"].default is None, "a file has only what the vehicle gives"
     whole = tmp_path / "whole.parm"
     assert command("save", "1", whole).code == 0
-    given = a_file(tmp_path, MC_ROLL_P=6.25, MC_PITCH_P=1.0)
+    given = metadata_file(tmp_path, MC_ROLL_P={"default": 6.25}, MC_PITCH_P={"default": 1.0})
     refused = command("save", "1", whole, "--metadata", given)
     assert (refused.code, "--metadata gives the defaults for --changed" in refused.err) == (2, True)
     converted = command("save", whole, tmp_path / "part.parm", "--changed", "--metadata", given)

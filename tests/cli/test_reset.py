@@ -10,7 +10,7 @@ import pytest
 from paramclient import ParamType
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from paramclient.wire import messages
-from tests.commands import Command, Put
+from tests.commands import Command, Put, metadata_file
 from tests.shell import Tap
 
 URL = "sim:custom"
@@ -69,11 +69,7 @@ def test_without_any_known_default_nothing_is_written(command: Command, put: Put
 def test_defaults_of_metadata_are_used_where_the_vehicle_gives_none(
     command: Command, put: Put, tmp_path: Path
 ) -> None:
-    described = tmp_path / "parameters.json"
-    described.write_text(
-        '{"version": 1, "parameters": [{"name": "A", "type": "Float", "default": 2.5}, '
-        '{"name": "C", "type": "Int32", "default": 7}]}'
-    )
+    described = metadata_file(tmp_path, A={"default": 2.5}, C={"type": "Int32", "default": 7})
     vehicle = GenericVehicle(table={"A": 5.0, "B": 6.0, "C": 7})
     words = ["reset", put(vehicle), "--all", "--metadata", described]
     planned = command(*words, "--dry-run")

@@ -12,7 +12,7 @@ import pytest
 
 from paramclient import read_file
 from paramclient.sim import Air, ArduPilotVehicle, Camera, PX4Vehicle
-from tests.commands import Command, Put, strict
+from tests.commands import Command, Put, metadata_file, strict
 from tests.shell import Eventful, Tap
 
 URL = "udpin:0.0.0.0:14550"
@@ -138,8 +138,7 @@ def test_set_and_reset_write_to_every_vehicle(command: Command, put: Put, tmp_pa
     assert [each["vehicle"]["kind"] for each in (first, second)] == ["PX4 quadrotor", "ArduPilot quadrotor"]
     assert [each["status"] for each in first["results"]] == ["accepted", "accepted"]
     assert [each["status"] for each in second["results"]] == ["accepted", "refused"]
-    described = tmp_path / "parameters.json"
-    described.write_text('{"version": 1, "parameters": [{"name": "A", "type": "Float", "default": 2.5}]}')
+    described = metadata_file(tmp_path, A={"default": 2.5})
     done = command("reset", url, "A", "--metadata", described, "--vehicle", "all")
     assert [row[:5] for row in done.rows] == [
         ["vehicle", "name", "before", "wanted", "now"],
@@ -201,10 +200,7 @@ def test_a_doubtful_value_is_written_only_after_a_question(
     command: Command, put: Put, at_terminal: Callable[[str], None], tmp_path: Path, name: str, value: str
 ) -> None:
     vehicle = copter()
-    described = tmp_path / "parameters.json"
-    described.write_text(
-        '{"version": 1, "parameters": [{"name": "A", "type": "Float", "min": 0, "max": 10}]}'
-    )
+    described = metadata_file(tmp_path, A={"min": 0, "max": 10})
     words = ("set", put(vehicle), name, value, "--metadata", described)
     before = dict(vehicle.values)
     refused = command(*words)
