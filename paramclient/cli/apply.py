@@ -405,8 +405,6 @@ class _Job:
             remarks.append(found.firmware_note)
         elif isinstance(found, ApplyResult):
             made, end, late = found.plan, f" in {found.elapsed:.1f} s", found.reboot_required
-            if found.system != session.component.system:
-                remarks.append(f"the vehicle is {found.system}/{found.component} now")
             if found.error is not None:
                 remarks.append(f"{found.error}; {self.state.to_continue}")
                 code = max(code, code_of(found.error))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -170,7 +171,7 @@ class SetJob:
         described: the metadata of the vehicle, or None.
         writes: the values by name.
         doubts: sentences on values outside the range, and on fractions for integers.
-        arrived: the outcomes so far, by name.
+        outcomes: one for each value by name; *unknown* for those without one so far.
     """
 
     columns: ClassVar[Sequence[str]] = ("name", "requested", "actual", "status", "reason")
@@ -181,7 +182,7 @@ class SetJob:
     described: Metadata | None = None
     writes: dict[str, Value] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
-    arrived: dict[str, SetOutcome] = field(default_factory=dict)
+    outcomes: dict[str, SetOutcome] = field(default_factory=dict)
 
     async def write(self) -> Self:
         """Write the values, and return the job, in which each has an outcome.
@@ -190,31 +191,26 @@ class SetJob:
             AmbiguousVehicle: as from `CommandSession.check_only`; nothing was written.
             NoReply, LinkError: nothing was written.
         """
-        session = self.session
+        session, numbers = self.session, itertools.count(1)
         await session.check_only()
+        self.outcomes = {pair[0]: SetOutcome(*pair, SetStatus.UNKNOWN) for pair in self.writes.items()}
 
         def update(outcome: SetOutcome) -> None:
-            self.arrived[outcome.name] = outcome
-            status.count(len(self.arrived), len(self.writes))
+            self.outcomes[outcome.name] = outcome
+            status.count(next(numbers), len(self.writes))
 
         label, timeout = session.label, session.deadline.left()
         with Status(f"waiting for {label} to acknowledge PARAM_SET", f"setting {label}") as status:
             done = await session.component.set_many(
                 self.writes, progress=update, timeout=timeout, settle=self.settle, force=self.force
             )
-        self.arrived = {each.name: each for each in done.outcomes}
+        self.outcomes = {each.name: each for each in done.outcomes}
         return self
-
-    @property
-    def outcomes(self) -> list[SetOutcome]:
-        """One outcome for each value; *unknown* for those without one, after an interruption."""
-        missing = {pair[0]: SetOutcome(*pair, SetStatus.UNKNOWN) for pair in self.writes.items()}
-        return [*(missing | self.arrived).values()]
 
     def as_json(self) -> JsonObject:
         """Return the JSON of the vehicle and the outcomes."""
         results = []
-        for each in self.outcomes:
+        for each in self.outcomes.values():
             known = self.session.component.params.get(each.name)
             kind = ParamType.REAL32 if known is None else known.type
             results.append(outcome_json(each, kind, info_of(self.described, each.name)))
@@ -232,11 +228,11 @@ class SetJob:
 
     def report(self) -> int:
         """Print the number of values with each outcome, and once why values were not tried."""
-        counts = Counter(each.status for each in self.outcomes)
+        counts = Counter(each.status for each in self.outcomes.values())
         if not self.session.options.json:
             words = ", ".join(f"{counts[status]} {status}" for status in SetStatus if status in counts)
             say(f"{self.session.receiver}: {words}")
-        errors = [(each.status, each.error) for each in self.arrived.values() if each.error is not None]
+        errors = [(each.status, each.error) for each in self.outcomes.values() if each.error is not None]
         if untried := [error for status, error in errors if status is SetStatus.NOT_TRIED]:
             report(f"{self.session.prefix}{untried[0]}")
         return max((code_of(error) for _, error in errors), default=0)

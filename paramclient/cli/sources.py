@@ -58,10 +58,10 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: boo
     for text in texts:
         check_link(sources.link_of(text))
     found: dict[str, ParamSet] = {}
-    for text in sorted(texts, key=lambda text: (not sources.is_file(text), not sources.is_offline(text))):
-        if text not in found:
-            (found[text],), _ = await sets_of(text, options, writes=writes)
-            options = replace(options, extended=options.extended or found[text].is_extended)
+    each = sorted({*texts}, key=lambda text: (not sources.is_file(text), not sources.is_offline(text), text))
+    for text in each:
+        (found[text],), _ = await sets_of(text, options, writes=writes)
+        options = replace(options, extended=options.extended or found[text].is_extended)
     return [found[text] for text in texts]
 
 
@@ -161,8 +161,6 @@ async def save(
         metadata: With --changed, a file with the firmware's defaults. Default: the stored metadata of the
             firmware.
     """
-    if metadata is not None and not changed:
-        raise UsageError("--metadata gives the defaults for --changed")
     written = file_format or format_of_name(str(file))
     try:
         sets, is_part = await sets_of(where, options, incomplete=incomplete)
