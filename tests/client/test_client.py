@@ -24,7 +24,6 @@ from paramclient import (
     ParamClient,
     ParamType,
     Progress,
-    SetOutcome,
     SetStatus,
     errors,
 )
@@ -417,38 +416,6 @@ async def test_a_link_that_stays_disconnected_fails_only_calls(caplog: pytest.Lo
 
 MANY: dict[str, int | float] = {f"MANY_{number:03}": float(number) for number in range(200)}
 NEW: dict[str, int | float] = {name: value + 0.5 for name, value in MANY.items()}
-
-
-async def test_each_value_has_an_outcome_of_its_own() -> None:
-    vehicle = ArduPilotVehicle(
-        table={**{name: float(value) for name, value in VALUES.items()}, "COUNT": 3},
-        read_only=["PARAM_03"],
-        live=(),
-        ftp=False,
-        param_error=True,
-    )
-    wanted = {"PARAM_01": 5.0, "NO_SUCH": 1.0, "COUNT": 7.6, "PARAM_03": 9.0, "PARAM_04": float("nan")}
-    seen: list[SetOutcome] = []
-    async with fetched(vehicle) as (_, component):
-        result = await component.set_many({**wanted, "PARAM_05": 6.0}, progress=seen.append)
-        assert {each.name: each.status for each in result.outcomes} == {
-            **dict.fromkeys(("PARAM_01", "PARAM_05"), "accepted"),
-            **dict.fromkeys(("NO_SUCH", "PARAM_03", "PARAM_04"), "refused"),
-            "COUNT": "adjusted",
-        }
-        for name, kind in (
-            ("NO_SUCH", errors.UnknownParameter),
-            ("PARAM_03", errors.Refused),
-            ("PARAM_04", errors.UsageError),
-        ):
-            assert isinstance(result[name].error, kind)
-        assert result["COUNT"].requested == 7.6
-        assert result["COUNT"].result is not None
-        assert result["COUNT"].result.actual == vehicle.params["COUNT"].value
-        assert (result.error, result.is_complete) == (None, False)
-        assert sorted(map(str, seen)) == sorted(map(str, result.outcomes))
-        with pytest.raises(KeyError):
-            result["PARAM_02"]
 
 
 async def test_the_timeout_is_that_of_the_whole_call() -> None:

@@ -417,22 +417,6 @@ async def test_a_stream_of_events_outlives_a_cancelled_wait_and_has_a_bound_and_
             await anext(each)
 
 
-async def test_several_listeners_hear_the_same() -> None:
-    vehicle = small_px4()
-    client = a_client(vehicle)
-    early = client.events()
-    async with client:
-        component = await client.component()
-        late = client.events()
-        await component.fetch_all()
-        await asyncio.sleep(3.0)
-        vehicle.reboot(anyio.current_time(), down=1.5)
-        await asyncio.sleep(5.0)
-        reported = await drained(early)
-        assert [event.kind for event in reported] == ["discovered", "rebooted", "resynced"]
-        assert await drained(late) == reported[1:]
-
-
 def silent_on(kind: str, delay: float = 0.05) -> tuple[Vehicle, Silence, dict[str, Value]]:
     """A vehicle, its link, on which it can go silent, and new values that no firmware limits."""
     vehicle = new_vehicle(kind)

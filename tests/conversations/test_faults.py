@@ -12,13 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paramclient.errors import NoReply, ParamClientError
+from paramclient.errors import ParamClientError
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import messages
-from tests.conversations.partial import Partial
 from tests.conversations.virtual import converse, jump, meanwhile, talking, virtual, virtual_on_both
 
 Faults: TypeAlias = dict[str, Any]
@@ -179,13 +178,6 @@ async def test_calls_go_on_after_the_computer_was_suspended(kind: str, at: float
 
 
 # components that bend the protocol
-
-
-async def test_a_component_without_parameters_at_all_is_no_reply_within_seconds() -> None:
-    async with talking(Partial(serves=("commands",))) as (_, session):
-        for call in (fetch_all(session), read(session, "MODE"), write(session, "MODE", 1)):
-            with pytest.raises(NoReply), anyio.fail_after(40.0):
-                await call
 
 
 async def test_a_slow_vehicle_is_waited_for() -> None:

@@ -158,13 +158,6 @@ async def test_a_first_fetch_waits_for_the_identity_but_not_for_long(known_at: f
         assert result.source == source
 
 
-async def test_dead_indices_are_missing() -> None:
-    async with talking(PX4Vehicle(dead=[3, 77])) as (_, session):
-        result = await fetch_all(session)
-        assert result.missing == (3, 77)
-        assert not result.complete
-
-
 async def test_a_list_that_stops_is_completed() -> None:
     for vehicle, count in ((PX4Vehicle(), 500), (ArduPilotVehicle(ftp=False), 700)):
         vehicle.when_listed(count, vehicle.stop_list)

@@ -186,17 +186,6 @@ async def test_uses_of_mavftp_take_turns() -> None:
 # the parameter file
 
 
-def serve_file(vehicle: ArduPilotVehicle, content: bytes) -> None:
-    """Let a vehicle serve another parameter file."""
-    vehicle.files.update(dict.fromkeys(("@PARAM/param.pck", "@PARAM/param.pck?withdefaults=1"), content))
-
-
-def pack_of(vehicle: ArduPilotVehicle, number: int | None = None) -> bytes:
-    """Return the parameter file of a vehicle, or of some of its parameters."""
-    rows = [PackedParam(each.name, each.type, each.bits) for each in vehicle.listed[:number]]
-    return encode(rows, total=len(rows) if number else None)
-
-
 @pytest.mark.parametrize(
     "content",
     [
@@ -211,7 +200,10 @@ async def test_a_file_that_is_not_valid_leads_to_the_list_and_drops_nothing(cont
     vehicle = ArduPilotVehicle()
     async with talking(vehicle) as (conversation, session):
         first = await fetch_all(session)
-        serve_file(vehicle, pack_of(vehicle)[:-7] if content is None else content)
+        if content is None:
+            rows = [PackedParam(each.name, each.type, each.bits) for each in vehicle.listed]
+            content = encode(rows)[:-7]
+        vehicle.files.update(dict.fromkeys(("@PARAM/param.pck", "@PARAM/param.pck?withdefaults=1"), content))
         second = await fetch_all(session)
         assert (first.source, second.source) == ("ftp", "stream")
         assert second.params.keys() == first.params.keys()

@@ -59,22 +59,6 @@ async def test_a_file_with_a_name_that_no_vehicle_can_have_is_shown_and_not_appl
         assert vehicle.requests["PARAM_SET"] == 0
 
 
-async def test_a_plan_writes_nothing_and_an_apply_what_was_planned(cache: str) -> None:
-    vehicle = generic()
-    async with browsing(vehicle, cache=cache) as browser:
-        wanted = {"file": {"name": "a.parm", "text": "PARAM_04 44\nPARAM_05 5\nNO_SUCH 1\n"}}
-        plan = (await browser.post(f"{V}/plan", json=wanted)).json()
-        assert plan["counts"]["set"] == 1
-        assert plan["params"]["NO_SUCH"]["category"] == "missing"
-        assert vehicle.param("PARAM_04").value == 4
-        problem(await browser.post(f"{V}/apply", json=wanted), 422, "invalid-parameters")
-        assert vehicle.param("PARAM_04").value == 4
-        done = (await browser.post(f"{V}/apply", json=wanted | {"partial": True})).json()
-        assert (done["counts"]["accepted"], done["unchecked"]) == (1, 1)
-        assert done["params"]["PARAM_04"]["status"] == "accepted"
-        assert vehicle.param("PARAM_04").value == 44
-
-
 async def test_an_apply_is_limited_to_names_and_refuses_values_out_of_range(cache: str) -> None:
     vehicle = PX4Vehicle(metadata=True)
     async with browsing(vehicle, cache=cache) as browser:
@@ -85,8 +69,10 @@ async def test_an_apply_is_limited_to_names_and_refuses_values_out_of_range(cach
         assert vehicle.param("MC_PITCH_P").value != 5.0
         done = (await browser.post(f"{V}/apply", json={**body, "only": ["MC_PITCH*"]})).json()
         assert list(done["params"]) == ["MC_PITCH_P"]
-        done = (await browser.post(f"{V}/apply", json={**body, "include": ["MC_ROLL_P"]})).json()
-        assert done["params"]["MC_ROLL_P"]["status"] == "accepted"
+        for value, forced in ((high, {"include": ["MC_ROLL_P"]}), (high + 1, {"force": True})):
+            body["values"]["MC_ROLL_P"] = value
+            done = (await browser.post(f"{V}/apply", json={**body, **forced})).json()
+            assert done["params"]["MC_ROLL_P"]["status"] == "accepted"
 
 
 async def test_a_restore_goes_back_to_before_the_last_apply_once(cache: str) -> None:
