@@ -544,6 +544,14 @@ def on_terminal(*arguments: object, **environment: str) -> Outcome:
         os.close(ours)
 
 
+def test_a_rate_is_that_of_a_while(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    shown = command("fetch", "sim:px4?rate=10000", "--no-cache").err
+    rates = [*map(int, re.findall(r"/903 ([0-9]+)/s", shown))]
+    assert len(rates) > 5
+    assert max(rates) < 400  # a parameter takes 37 bytes
+
+
 def test_progress_is_drawn_on_a_terminal(tmp_path: Path) -> None:
     shown = on_terminal("fetch", "sim:px4", "--no-cache")
     assert shown.code == 0

@@ -71,6 +71,8 @@ def test_a_file_must_be_metadata_of_a_known_vehicle(tmp_path: Path) -> None:
         files.add(DATA / "parameters.json", firmware="../4")
     with pytest.raises(FileError):
         files.add(DATA / "px4_flight.ulg", "px4")
+    with pytest.raises(UsageError, match="added: px4 any version, rover any version"):
+        files.remove("copter")
 
 
 def test_a_damaged_copy_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
