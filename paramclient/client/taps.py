@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import struct
 import time
 from collections import Counter, defaultdict, deque
@@ -25,7 +24,7 @@ import anyio.to_thread
 from paramclient.errors import UsageError
 from paramclient.links.tlog import packed_time
 from paramclient.protocol.addresses import Address
-from paramclient.wire.frames import Frame, bears_key, checksum, unsign_frame
+from paramclient.wire.frames import Frame, bears_key, checksum, find_magic, unsign_frame
 from paramclient.wire.loss import SequenceCheck
 from paramclient.wire.messages import Heartbeat, decode
 from paramclient.wire.signing import SIGNATURE_LENGTH
@@ -37,7 +36,6 @@ UNFINISHED_PEERS_MAX: Final = 256
 
 _MAGIC_V1 = 0xFE
 _MAGICS = (b"\xfd", b"\xfe")
-_MAGIC = re.compile(b"[\xfd\xfe]").search
 _SIGNED = 0x01
 _HEADER_LENGTH = 10  # of MAVLink 2
 
@@ -112,7 +110,7 @@ class FrameCutter:
         data = self._undecided.pop(peer, b"") + data
         seen: list[SeenFrame] = []
         decided = at = 0
-        while (found := _MAGIC(data, at)) is not None:
+        while (found := find_magic(data, at)) is not None:
             at = found.start()
             each = _frame_at(data, at)
             if each.is_proven:
@@ -142,7 +140,7 @@ class FrameCutter:
     def _classified(self, gap: bytes) -> Iterator[SeenFrame]:
         """Count the bytes between two proven frames; return the frames that nothing proves."""
         at = 0
-        while (found := _MAGIC(gap, at)) is not None:
+        while (found := find_magic(gap, at)) is not None:
             start = found.start()
             self.other_bytes += start - at
             each = _frame_at(gap, start)

@@ -8,8 +8,9 @@ the port before it returns, and no transport, task or thread outlives it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable
-from typing import Final, NoReturn, Protocol, TypeAlias, runtime_checkable
+from collections.abc import Callable, Hashable
+from contextlib import suppress
+from typing import Any, Final, NoReturn, Protocol, TypeAlias, runtime_checkable
 
 import anyio
 import anyio.lowlevel
@@ -19,6 +20,9 @@ from paramclient.errors import LinkError
 Peer: TypeAlias = Hashable
 """The sender of data: an address on UDP, a connection on TCP, a constant on links with one remote end."""
 
+READ_SIZE: Final = 65536
+"""Bytes that are read at once, at most: of one connection before the next one is read. Of a serial port,
+Linux holds 4,095 for a reader, and bytes that arrive meanwhile in the driver."""
 OPEN_TIMEOUT: Final = 5.0
 """Seconds for resolving a name and connecting. A TCP connection on a slow radio takes about 1 s."""
 
@@ -96,7 +100,7 @@ class BaseLink(ABC):
         except BaseException as error:
             if opening == self._openings:
                 await self._end("closed")
-            elif isinstance(error, OSError):
+            elif isinstance(error, OSError | anyio.ClosedResourceError):
                 self._check(opening)
             if isinstance(error, OSError) and not isinstance(error, LinkError):
                 raise self._error(self._refusal(error)) from error
@@ -161,8 +165,10 @@ class StreamLink(BaseLink):
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`: one chunk."""
         opening = self._opened()
+        data = b""
         try:
-            data = await self._read()
+            with suppress(anyio.ClosedResourceError):
+                data = await self._read()
         except OSError as error:
             await self._fail(opening, self._loss(error), error)
         if not data:
@@ -178,22 +184,44 @@ class StreamLink(BaseLink):
         opening = self._opened()
         if peer in (None, (self.name, opening)):
             try:
-                await self._write(data)
+                with suppress(anyio.ClosedResourceError):
+                    await self._write(data)
             except OSError as error:
                 await self._fail(opening, self._loss(error), error)
             self._check(opening)
 
     @abstractmethod
     async def _read(self) -> bytes:
-        """Wait for bytes; return b"" if the remote end has closed the link. OSError: the link dropped."""
+        """Wait for bytes; return b"" if the remote end has closed the link.
+
+        OSError: the link dropped. ClosedResourceError: it was closed meanwhile.
+        """
 
     @abstractmethod
     async def _write(self, data: bytes) -> None:
-        """Send all bytes. OSError: the link dropped, or has no space until a timeout."""
+        """Send all bytes; errors as in `_read`, also if there is no space until a timeout."""
 
     @abstractmethod
     def _loss(self, error: OSError | None) -> str:
         """Return why the link has dropped: an error, or None where the remote end has closed it."""
+
+
+async def read_some(source: Any, read: Callable[[int], bytes]) -> bytes:
+    """Wait for bytes of a socket or a file descriptor, and read them without blocking."""
+    while True:
+        await anyio.wait_readable(source)
+        with suppress(BlockingIOError):
+            return read(READ_SIZE)
+
+
+async def write_all(target: Any, write: Callable[[memoryview], int], data: bytes) -> None:
+    """Write all bytes to a socket or a file descriptor without blocking; wait for space."""
+    view = memoryview(data)
+    while view:
+        try:
+            view = view[write(view) :]
+        except BlockingIOError:
+            await anyio.wait_writable(target)
 
 
 def reason(error: OSError) -> str:

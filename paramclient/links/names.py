@@ -97,8 +97,6 @@ def parse_link(text: str) -> LinkSpec:
     Raises:
         UsageError: the name has none of the accepted forms; the error lists them.
     """
-    if not isinstance(text, str):
-        raise UsageError(f"a link name is a string, not {type(text).__name__}")
     name = text.strip()
     try:
         return _parse(name)
@@ -107,11 +105,7 @@ def parse_link(text: str) -> LinkSpec:
         raise UsageError(f"link name {shown!r}: {problem}\naccepted forms:\n{FORMS}") from None
 
 
-_SCHEMES: dict[str, LinkKind] = {
-    **{kind.value: kind for kind in LinkKind},
-    "udp": LinkKind.UDPIN,
-    "tcpout": LinkKind.TCP,
-}
+_SCHEMES = {kind.value: kind for kind in LinkKind} | {"udp": LinkKind.UDPIN, "tcpout": LinkKind.TCP}
 _LISTENING = frozenset({LinkKind.UDPIN, LinkKind.TCPIN})
 
 _SERVICE = re.compile(r"https?://", re.IGNORECASE)

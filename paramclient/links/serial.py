@@ -31,15 +31,12 @@ import anyio.lowlevel
 import anyio.to_thread
 
 from paramclient.errors import UsageError
-from paramclient.links.link import OPEN_TIMEOUT, StreamLink, reason
+from paramclient.links.link import OPEN_TIMEOUT, READ_SIZE, StreamLink, read_some, reason, write_all
 from paramclient.links.names import DEFAULT_BAUD, LinkKind, LinkSpec
 
 if sys.platform != "win32":
     import fcntl
     import termios
-
-READ_SIZE: Final = 65536
-"""Bytes per read. Linux holds 4,095 for a reader, and bytes that arrive meanwhile in the driver."""
 
 STALL_TIMEOUT: Final = 5.0
 """Seconds without progress, in addition to those that a full buffer takes at the port's rate, after which a
@@ -117,15 +114,28 @@ class SerialLink(StreamLink):
     def _refusal(self, error: OSError) -> str:
         if isinstance(error, TimeoutError):
             return f"{self.device} did not open within {OPEN_TIMEOUT:g} s"
-        return device_refusal(self.device, self.baud, error)
+        ports = "'paramclient ports' lists the serial ports"
+        if error.errno in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+            return f"{self.device} does not exist. {ports}"
+        if error.errno == errno.EBUSY or (sys.platform == "win32" and error.errno == errno.EACCES):
+            other = "another link or program, such as a ground station or ModemManager"
+            return f"{self.device} is in use by {other}"
+        if error.errno in (errno.EACCES, errno.EPERM):
+            user = "Is the user in the group of the port (dialout or uucp)?"
+            return f"no permission to open {self.device}. {user}"
+        if error.errno in (errno.ENOTTY, errno.EISDIR):
+            return f"{self.device} is not a serial port. {ports}"
+        if error.errno == errno.EINVAL:
+            return f"{self.device} cannot be set to {self.baud} baud"
+        return super()._refusal(error)
 
 
 class Port(NamedTuple):
     """An open port.
 
     Attributes:
-        read: waits for bytes; b"" if the port has hung up, or is closed meanwhile.
-        write: waits until the operating system has accepted all bytes, or the port is closed.
+        read: waits for bytes; b"" if the port has hung up.
+        write: waits until the operating system has accepted all bytes.
         close: wakes waiting tasks, drops unsent bytes, closes. Takes at most `CLOSE_TIMEOUT`.
     """
 
@@ -176,23 +186,6 @@ if sys.platform != "win32":
             port.close()
             raise
 
-        async def read() -> bytes:
-            with suppress(anyio.ClosedResourceError):
-                while True:
-                    await anyio.wait_readable(file)
-                    with suppress(BlockingIOError):
-                        return os.read(file, READ_SIZE)
-            return b""
-
-        async def write(data: bytes) -> None:
-            view = memoryview(data)
-            with suppress(anyio.ClosedResourceError):
-                while view:
-                    try:
-                        view = view[os.write(file, view) :]
-                    except BlockingIOError:
-                        await anyio.wait_writable(file)
-
         async def close() -> None:
             anyio.notify_closing(file)
             with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
@@ -205,7 +198,8 @@ if sys.platform != "win32":
             with suppress(OSError):
                 port.close()
 
-        return Port(read, write, close)
+        read = partial(read_some, file, partial(os.read, file))
+        return Port(read, partial(write_all, file, partial(os.write, file)), close)
 
 
 AUTOPILOT_VENDORS: Final = {
@@ -319,19 +313,3 @@ def _order(port: SerialPort) -> tuple[bool, bool, list[tuple[str, int]]]:
         port.vendor_id is None,
         [(text, int(number or 0)) for text, number in parts],
     )
-
-
-def device_refusal(device: str, baud: int, error: OSError) -> str:
-    """Return why a serial port cannot be opened."""
-    ports = "'paramclient ports' lists the serial ports"
-    if error.errno in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-        return f"{device} does not exist. {ports}"
-    if error.errno == errno.EBUSY or (sys.platform == "win32" and error.errno == errno.EACCES):
-        return f"{device} is in use by another link or program, such as a ground station or ModemManager"
-    if error.errno in (errno.EACCES, errno.EPERM):
-        return f"no permission to open {device}. Is the user in the group of the port (dialout or uucp)?"
-    if error.errno in (errno.ENOTTY, errno.EISDIR):
-        return f"{device} is not a serial port. {ports}"
-    if error.errno == errno.EINVAL:
-        return f"{device} cannot be set to {baud} baud"
-    return f"cannot open {device}: {reason(error)}"

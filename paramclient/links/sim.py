@@ -6,7 +6,6 @@ vehicle on a real link, for other programs.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 import anyio
@@ -18,7 +17,7 @@ from paramclient.links.link import BaseLink, Link, Peer
 from paramclient.links.names import VEHICLE_OPTIONS, LinkSpec
 
 if TYPE_CHECKING:
-    from paramclient.sim import Endpoint, Vehicle
+    from paramclient.sim import Endpoint
 
 SIM_PEER: Final = "sim"
 """The only peer of a `SimLink`."""
@@ -115,7 +114,6 @@ def simulated(spec: LinkSpec, **options: Any) -> SimLink:
     """
     from paramclient import sim  # imported here: loads parameter tables
 
-    kinds: dict[str, Callable[..., Vehicle]]
     kinds = {"px4": sim.PX4Vehicle, "ardupilot": sim.ArduPilotVehicle, "camera": sim.Camera}
     faults: dict[str, Any] = dict(spec.options)
     options |= {key: faults.pop(key) for key in VEHICLE_OPTIONS if key in faults}

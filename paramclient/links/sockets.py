@@ -34,7 +34,7 @@ from zlib import crc32
 import anyio
 import anyio.lowlevel
 
-from paramclient.links.link import BaseLink, Peer, StreamLink, reason
+from paramclient.links.link import READ_SIZE, BaseLink, Peer, StreamLink, read_some, reason, write_all
 from paramclient.links.names import LinkSpec
 from paramclient.wire.frames import Framer
 
@@ -71,9 +71,6 @@ senders."""
 
 PRIVILEGED_PORTS: Final = 1024
 """Ports below this number need privileges on POSIX systems."""
-
-READ_SIZE: Final = 65536
-"""Bytes that are read from one connection before the next one is read."""
 
 
 class SocketLink(BaseLink):
@@ -323,10 +320,7 @@ class TcpOut(SocketLink, StreamLink):
     """`tcp`: one outgoing connection. `open` makes a new one after it has dropped."""
 
     async def _read(self) -> bytes:
-        while True:
-            await self._readable(self._socket, self._openings)
-            with suppress(BlockingIOError):
-                return self._socket.recv(READ_SIZE)
+        return await read_some(self._socket, self._socket.recv)
 
     async def _write(self, data: bytes) -> None:
         await _send_all(self._socket, data)
@@ -343,7 +337,7 @@ class TcpOut(SocketLink, StreamLink):
             _set_up(sock)
             status = sock.connect_ex(address)
             if status in (errno.EINPROGRESS, errno.EWOULDBLOCK):
-                await _writable(sock)
+                await anyio.wait_writable(sock)
                 status = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
             if not status:
                 return
@@ -392,7 +386,7 @@ class TcpIn(SocketLink):
         for client in tuple(known):
             try:
                 await _send_all(client, data)
-            except OSError:
+            except (OSError, anyio.ClosedResourceError):
                 self._check(opening)
                 with suppress(OSError):
                     client.shutdown(socket.SHUT_RDWR)  # `receive` then reads the end, reports and closes it
@@ -476,20 +470,8 @@ def _set_up(sock: socket.socket) -> None:
 
 
 async def _send_all(sock: socket.socket, data: bytes) -> None:
-    """Send all bytes; OSError if the connection dropped, was closed here, or stalled for `SEND_TIMEOUT`."""
-    view = memoryview(data)
+    """Send all bytes; OSError if the connection dropped, or stalled for `SEND_TIMEOUT`."""
     with anyio.move_on_after(SEND_TIMEOUT):
-        while view:
-            try:
-                view = view[sock.send(view) :]
-            except BlockingIOError:
-                await _writable(sock)
+        await write_all(sock, sock.send, data)
         return
     raise OSError(errno.ETIMEDOUT, f"the peer has not read any data for {SEND_TIMEOUT:g} s")
-
-
-async def _writable(sock: socket.socket) -> None:
-    try:
-        await anyio.wait_writable(sock)
-    except anyio.ClosedResourceError:
-        raise OSError(errno.EBADF, os.strerror(errno.EBADF)) from None

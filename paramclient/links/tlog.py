@@ -6,7 +6,6 @@ The file format of Mission Planner, MAVProxy, QGroundControl and pymavlink.
 from __future__ import annotations
 
 import math
-import re
 import struct
 from collections.abc import Iterator
 from io import BytesIO
@@ -19,6 +18,7 @@ import anyio.lowlevel
 from paramclient.errors import LinkError
 from paramclient.links.link import BaseLink, Peer, reason
 from paramclient.links.names import LinkSpec
+from paramclient.wire.frames import find_magic, frame_size
 
 BLOCK_SIZE: Final = 65536
 """Bytes per read."""
@@ -35,9 +35,6 @@ _TIME: Final = struct.Struct(">Q")
 _LONGEST_RECORD: Final = 8 + 12 + 255 + 13
 _RECORD_CHECK_SIZE: Final = _LONGEST_RECORD + 8 + 3
 """Bytes that decide whether a record is valid: the record, and the beginning of the next one."""
-_MAGIC_V1: Final = 0xFE
-_MAGIC_V2: Final = 0xFD
-_MAGIC: Final = re.compile(b"[\xfd\xfe]").search
 
 
 class Record(NamedTuple):
@@ -104,7 +101,7 @@ def read_records(file: BinaryIO) -> Iterator[Record]:
             buffer = buffer[start:] + block
             start = 0
             continue
-        size = _size_at(buffer, start + 8)
+        size = frame_size(buffer, start + 8)
         if size is None:
             return
         end = start + 8 + size
@@ -117,19 +114,8 @@ def read_records(file: BinaryIO) -> Iterator[Record]:
             before = at
             start = end
         else:
-            candidate = _MAGIC(buffer, start + 9)
+            candidate = find_magic(buffer, start + 9)
             start = max(start + 1, len(buffer) - 8) if candidate is None else candidate.start() - 8
-
-
-def _size_at(buffer: bytes, at: int) -> int | None:
-    """Return the size of the frame at a position, 0 for no frame, None if the end cuts off its header."""
-    if at + 3 > len(buffer):
-        return None
-    if buffer[at] == _MAGIC_V1:
-        return 8 + buffer[at + 1]
-    if buffer[at] == _MAGIC_V2:
-        return 12 + buffer[at + 1] + (13 if buffer[at + 2] & 1 else 0)
-    return 0
 
 
 def _time_at(buffer: bytes, at: int) -> float:
@@ -138,7 +124,7 @@ def _time_at(buffer: bytes, at: int) -> float:
 
 def _is_confirmed(buffer: bytes, end: int, at: float, alone: bool) -> bool:
     """Return whether the next record has about the same time; at the end of the file, return `alone`."""
-    size = _size_at(buffer, end + 8)
+    size = frame_size(buffer, end + 8)
     if size is None:
         return alone
     return size > 0 and abs(_time_at(buffer, end) - at) <= TIME_STEP_MAX
@@ -187,7 +173,12 @@ class ReplayLink(BaseLink):
         while self._next is not None and self._due <= anyio.current_time() and len(found) < RECORDS_PER_READ:
             found.append((LOG_PEER, self._next.data))
             self.at = self._next.at
-            self._advance(self._next)
+            try:
+                self._next = next(self._records, None)
+            except OSError as error:
+                raise self._error(f"cannot read: {reason(error)}") from error
+            if self._next is not None and self._speed:
+                self._due += min(max(self._next.at - self.at, 0.0), PAUSE_MAX) / self._speed
         if not found:  # the log is over
             self._due = math.inf
         return found
@@ -206,15 +197,6 @@ class ReplayLink(BaseLink):
 
     async def _release(self) -> None:
         self._closed.set()
-        self._records = iter(())
         if self._file is not None:
             self._file.close()
             self._file = None
-
-    def _advance(self, before: Record) -> None:
-        try:
-            self._next = next(self._records, None)
-        except OSError as error:
-            raise self._error(f"cannot read: {reason(error)}") from error
-        if self._next is not None and self._speed:
-            self._due += min(max(self._next.at - before.at, 0.0), PAUSE_MAX) / self._speed

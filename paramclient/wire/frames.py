@@ -19,7 +19,6 @@ from paramclient.wire.signing import SIGNATURE_LENGTH, Signer
 _MAGIC_V1 = 0xFE
 _MAGIC_V2 = 0xFD
 _SIGNED = 0x01
-_MAGIC = re.compile(b"[\xfd\xfe]").search
 _START = struct.Struct("<BBBxBBB3s").unpack_from  # a header of MAVLink 2; version 1 shares two bytes
 _CRC_AT = struct.Struct("<H").unpack_from
 _HEADER_LENGTH = 10  # of MAVLink 2
@@ -27,6 +26,9 @@ _PADDING = bytes(_HEADER_LENGTH)  # behind the data: a header can be read at its
 _new = tuple.__new__  # the constructor of a named tuple ends in this call and takes twice as long
 _SETUP_SIGNING = (256).to_bytes(3, "little")
 _NO_KEY = b""  # of no message
+
+find_magic: Final = re.compile(b"[\xfd\xfe]").search
+"""Finds the next byte with which a frame can begin."""
 
 
 class Frame(NamedTuple):
@@ -179,7 +181,7 @@ class Framer:
                 continue
             if extra is not None and end <= length:
                 self.damaged += 1
-            candidate = _MAGIC(data, at + 1)
+            candidate = find_magic(data, at + 1)
             next_at = candidate.start() if candidate else length
             skipped += next_at - at
             at = next_at
@@ -198,6 +200,17 @@ class Framer:
         is_proven = crc_at + 2 <= len(data) and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[1:crc_at] + extra)
         if self._guard is not None and is_proven:
             self._guard(data)
+
+
+def frame_size(data: bytes, at: int) -> int | None:
+    """Return the size of the frame at a position, 0 for no frame, None if the end cuts off its header."""
+    if at + 3 > len(data):
+        return None
+    if data[at] == _MAGIC_V1:
+        return 8 + data[at + 1]
+    if data[at] == _MAGIC_V2:
+        return 12 + data[at + 1] + (SIGNATURE_LENGTH if data[at + 2] & _SIGNED else 0)
+    return 0
 
 
 def _flagged(frame: bytes, flags: int) -> bytes:
