@@ -412,8 +412,7 @@ class _Job:
             say(f"{summary}; {self.state.to_continue}")
             return code
         say(f"{summary}{end}")
-        skipped = [row.category for row in found.of(ApplyStatus.SKIPPED) if row.differs]
-        if left_out := Counter(category for category in skipped if category in _INCLUDABLE):
+        if left_out := Counter(row.category for row in found.shown_rows if row.category in _INCLUDABLE):
             counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
             includes = " ".join(f"--include {category}" for category in left_out)
             remarks.append(f"left out: {counts}; to write them: {includes}")

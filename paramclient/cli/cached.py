@@ -158,8 +158,6 @@ def history(
     if snapshots and names:
         raise UsageError("--snapshots lists whole tables and takes no parameter name")
     chosen, begin = check_given(names), None if since is None else parse_time(since, time.time())
-    if begin is not None and not options.json:
-        say(f"since {local_time(begin)}")
     with ParamCache(options.cache) as cache:
         tables = tables_in(cache, vehicle, extended=extended)
         key, component = tables[0].key, component_of(vehicle)

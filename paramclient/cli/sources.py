@@ -188,9 +188,7 @@ async def save(
         if not options.json:
             contents = [f"{counted(len(each), noun_of(each))} of {address(each)}" for each in of_file]
             say(f"{', '.join(contents)} written to {path} ({written})")
-    if not found:
-        report(f"nothing was written to {file}")
-    elif options.json:
+    if found and options.json:
         print_json(found[0] if len(found) == 1 else {"files": found})
     return ExitCode.DONE if found and not is_part else ExitCode.INCOMPLETE
 
