@@ -28,7 +28,7 @@ def main() -> NoReturn:
         )
         sys.exit(2)
     try:
-        from paramclient.cli import run  # imported here because it needs the extra
+        from paramclient.cli.app import run  # imported here because it needs the extra
 
         gc.freeze()  # modules stay loaded: excluding them saves 10 ms and more per full collection
         code = run(sys.argv[1:])

@@ -14,8 +14,9 @@ import anyio.to_thread
 import pytest
 
 from paramclient import ParamClient
-from paramclient.cli import run, signing
 from paramclient.cli import session as cli_session
+from paramclient.cli import signing
+from paramclient.cli.app import run
 from paramclient.links import SimLink
 from paramclient.sim import Endpoint
 from tests.shell import PeersLink, SimulatedTimeLoop, while_the_clock_stands

@@ -17,7 +17,7 @@ from unittest import mock
 
 import pytest
 
-from paramclient import cli
+from paramclient.cli import app
 from tests.simulated_on_udp import free_port
 
 ROOT = Path(__file__).parent.parent
@@ -178,7 +178,7 @@ def help_of(*words: str) -> str:
     """What the command prints about itself or a subcommand, in this process."""
     printed = io.StringIO()
     with mock.patch.dict(os.environ, COLUMNS="200"), redirect_stdout(printed):
-        cli.run([*words, "--help"])
+        app.run([*words, "--help"])
     return printed.getvalue()
 
 

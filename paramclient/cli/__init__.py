@@ -11,16 +11,3 @@
 - `output`: tables, lines, the status line, exit codes.
 - `json_output`: JSON.
 """
-
-from __future__ import annotations
-
-from collections.abc import Sequence
-
-__all__ = ["run"]
-
-
-def run(arguments: Sequence[str]) -> int:
-    """Run the command line, see `app.run`. The libraries that it needs are imported only now."""
-    from paramclient.cli import app
-
-    return app.run(arguments)

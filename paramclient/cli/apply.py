@@ -17,7 +17,7 @@ from cyclopts import Parameter
 from paramclient import errors
 from paramclient.cache.moments import parse_moment
 from paramclient.cli.json_output import JsonObject, apply_json, plan_json, row_json, rows_json
-from paramclient.cli.metadata import MetadataChoice, default_in, known_of_session, no_defaults, say_sources
+from paramclient.cli.metadata import MetadataChoice, default_in, known_of_session, say_sources
 from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import ExitCode, Status, can_ask, code_of, confirm, listed, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, check_given, get_chosen, sessions
@@ -32,7 +32,7 @@ from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyRe
 from paramclient.provision.execution import run as run_apply
 from paramclient.provision.inspection import plan, wait_for_identity
 from paramclient.provision.planning import ApplyRow, ApplyStatus, Plan, Rows
-from paramclient.provision.sources import choose, is_file, read_source
+from paramclient.provision.sources import NO_DEFAULTS, choose, is_file, read_source
 
 _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be revealed"}
 """Words for planned actions in the summary, where they differ from the status."""
@@ -238,7 +238,7 @@ async def _defaults(chosen: Sequence[str], choice: MetadataChoice, session: Comm
     found = {param.name: default_in(known, param) for param in params}
     wanted = {name: default.value for name, default in found.items() if default is not None}
     if not wanted:
-        raise errors.VehicleError(no_defaults(), *session.component.address)
+        raise errors.VehicleError(NO_DEFAULTS, *session.component.address)
     say_sources(session.label, found.values())
     without = [name for name in found if name not in wanted]
     if is_cut := bool(missing) and any(map(is_pattern, chosen)):

@@ -144,13 +144,6 @@ def say_sources(label: str, defaults: Iterable[Default | None]) -> None:
         say(f"{label}: {what}, which does not have the defaults of an airframe")
 
 
-def no_defaults() -> str:
-    """Return `NO_DEFAULTS`."""
-    from paramclient.provision.sources import NO_DEFAULTS  # only here: loads provision
-
-    return NO_DEFAULTS
-
-
 # Subcommands
 
 

@@ -10,7 +10,7 @@ from functools import partial
 import anyio
 
 from paramclient.cli.json_output import JsonObject, fetch_json, info_of, param_json, param_value, taken
-from paramclient.cli.metadata import MetadataChoice, default_in, known_of_session, no_defaults, say_sources
+from paramclient.cli.metadata import MetadataChoice, default_in, known_of_session, say_sources
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     ExitCode,
@@ -66,7 +66,9 @@ async def fetch(
                 known = await known_of_session(session, metadata)
             defaults = {param.name: default_in(known, param) for param in params} if changed else {}
             if changed and not any(defaults.values()):
-                raise VehicleError(no_defaults(), *session.component.address)
+                from paramclient.provision.sources import NO_DEFAULTS  # only here: loads provision
+
+                raise VehicleError(NO_DEFAULTS, *session.component.address)
             kept = chosen.choose({param.name for param in params}) if names else {*result.params}
             if changed:
                 given = {name: default.value for name, default in defaults.items() if default}

@@ -13,7 +13,6 @@ from paramclient.cli.metadata import (
     default_in,
     defaults_in,
     known_of_sets,
-    no_defaults,
     say_sources,
 )
 from paramclient.cli.options import CacheOptions
@@ -38,7 +37,7 @@ from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import time_text
 from paramclient.model.paramset import add_defaults
 from paramclient.model.values import check_name
-from paramclient.provision.sources import link_of, read_source, resolve, tables_in
+from paramclient.provision.sources import NO_DEFAULTS, link_of, read_source, resolve, tables_in
 
 
 async def show(
@@ -85,7 +84,7 @@ async def show(
         shown = part_of(part, non_defaults(add_defaults(part, defaults_in(known, part)))) if changed else part
         views.append((shown, known, defaults))
     if changed and not any(defaults for _, _, defaults in views):
-        report(no_defaults())
+        report(NO_DEFAULTS)
         return ExitCode.INCOMPLETE
     items = [set_json(shown, known, whole=bool(chosen)) for shown, known, _ in views]
     if options.json:

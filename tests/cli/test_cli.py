@@ -25,7 +25,7 @@ import pytest
 
 import paramclient
 from paramclient import LinkError, ParamType, errors
-from paramclient.cli import run
+from paramclient.cli.app import run
 from paramclient.cli.output import ExitCode, code_of
 from paramclient.errors import ClientClosed, ParamClientError
 from paramclient.links import Peer, SimLink

@@ -10,7 +10,7 @@ import anyio
 import pytest
 
 from paramclient import NoReply, ParamType, Policy, SyncState, Trust, UsageError
-from paramclient.cli import run
+from paramclient.cli.app import run
 from paramclient.client.component import PASSIVE_TIMEOUT
 from paramclient.model.values import Encoding, encode_value
 from paramclient.wire import messages

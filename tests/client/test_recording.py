@@ -14,7 +14,7 @@ import anyio
 import pytest
 
 from paramclient import UsageError
-from paramclient.cli import run
+from paramclient.cli.app import run
 from paramclient.client import taps
 from paramclient.links.tlog import TIME_MAX, TIME_STEP_MAX, Record, packed_time, read_records
 from paramclient.sim import ArduPilotVehicle
