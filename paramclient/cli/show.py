@@ -7,14 +7,7 @@ from collections.abc import Iterator, Sequence
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.cached import show_summaries
 from paramclient.cli.json_output import info_json, info_of, param_value, set_json, table_param_json, taken
-from paramclient.cli.metadata import (
-    METADATA_HINT,
-    MetadataFile,
-    default_in,
-    defaults_in,
-    known_of_sets,
-    say_sources,
-)
+from paramclient.cli.metadata import METADATA_HINT, MetadataFile, default_in, known_of_sets, say_sources
 from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import (
     ExitCode,
@@ -81,7 +74,8 @@ async def show(
     for whole, known in zip(sets, known_of_sets(sets, options, metadata), strict=True):
         part = part_of(whole, kept)
         defaults = {name: default for name, each in part.items() if (default := default_in(known, each))}
-        shown = part_of(part, non_defaults(add_defaults(part, defaults_in(known, part)))) if changed else part
+        given = {name: default.value for name, default in defaults.items()}
+        shown = part_of(part, non_defaults(add_defaults(part, given))) if changed else part
         views.append((shown, known, defaults))
     if changed and not any(defaults for _, _, defaults in views):
         report(NO_DEFAULTS)
