@@ -15,6 +15,8 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import NamedTuple
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
 
 MODEL = {"errors", "model"}
@@ -175,22 +177,6 @@ def test_libraries_are_imported_where_they_belong() -> None:
     ] == []
 
 
-def test_simulators_and_the_service_load_when_they_are_used() -> None:
-    """And only the command knows the service."""
-    assert [
-        f"{each.place} imports {target}"
-        for module, target, each in own_imports()
-        if (
-            is_in(target, {"sim"}) and each.runs_at_import and not is_in(module, {*PURE, *COMMAND, "testing"})
-        )
-        or (
-            is_in(target, {"service"})
-            and not is_in(module, {"service"})
-            and (each.runs_at_import or not is_in(module, COMMAND))
-        )
-    ] == []
-
-
 def test_the_core_touches_nothing_outside() -> None:
     """Time and bytes are arguments, and randomness has a seed."""
     offenders = []
@@ -289,12 +275,22 @@ def test_one_name_has_one_meaning() -> None:
     } == {}
 
 
-def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
+ON_USE = {"paramclient.sim", "paramclient.service", "rich"}
+UNUSED = ON_USE | {f"paramclient.{room}" for room in ("testing", "cli", "provision", "sync")}
+UNUSED |= {"pymavlink.mavutil", "pydantic", *LIBRARIES} - {"pymavlink", "asyncio", "anyio"}
+
+
+@pytest.mark.parametrize(
+    ("start", "unwanted"),
+    [
+        ("from paramclient import *", UNUSED),
+        ("import paramclient.sync, paramclient.provision, paramclient.logs", ON_USE),
+        ("import paramclient.cli", ON_USE),
+    ],
+)
+def test_importing_loads_nothing_that_only_some_need(start: str, unwanted: set[str]) -> None:
     """Start-up is part of the command's promise; mavutil, besides, changes the process that imports it."""
-    unwanted = {"pymavlink.mavutil", "pydantic", *LIBRARIES} - {"pymavlink", "asyncio", "anyio"}
-    rooms = ("sim", "testing", "cli", "provision", "service", "sync")
-    unwanted |= {f"paramclient.{room}" for room in rooms}
-    program = f"import sys; from paramclient import *; print(sorted({unwanted!r} & sys.modules.keys()))"
+    program = f"import sys; {start}; print(sorted({unwanted!r} & sys.modules.keys()))"
     run = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
     )

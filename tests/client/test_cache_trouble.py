@@ -17,7 +17,7 @@ import anyio
 import pytest
 
 from paramclient import CacheError, NotDurable, ParamCache, ParamClient, Trust, UnknownParameter, UsageError
-from paramclient.cache import TableUpdate, database
+from paramclient.cache import database
 from paramclient.client import cache_writer
 from paramclient.provision import apply
 from paramclient.sim import PX4Vehicle
@@ -41,15 +41,10 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
-@contextmanager
-def full(path: Path) -> Iterator[None]:
-    """The disk of the file has no room."""
-    with full_disk(100):
-        yield
-
-
 Holding = Callable[[Path], AbstractContextManager[None]]
-UNWRITABLE = pytest.mark.parametrize("unwritable", [locked, full], ids=["locked", "full"])
+UNWRITABLE = pytest.mark.parametrize(
+    "unwritable", [locked, lambda path: full_disk(100)], ids=["locked", "full"]
+)
 
 
 HOUR = 3600.0
@@ -306,11 +301,7 @@ def damage(path: Path) -> None:
 def put_another_in_its_place(path: Path) -> None:
     delete(path)
     with ParamCache(path) as other:
-        other.save(of_another_vehicle())
-
-
-def of_another_vehicle() -> TableUpdate:
-    return update(stored("OTHER", 1), identity=replace(PX4, system=7))
+        other.save(update(stored("OTHER", 1), identity=replace(PX4, system=7)))
 
 
 @pytest.mark.parametrize("happens", [delete, move, damage, put_another_in_its_place])

@@ -158,16 +158,12 @@ async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -
 # all vehicles, or an expected number
 
 
-def fleet() -> Air:
-    """Four vehicles, found one after the other, and a camera of the first."""
-    vehicles = [Late(small_px4(system=number), 0.7 * number) for number in (1, 2, 3, 4)]
-    return Air([*vehicles, generic(system=1, component=100)])
-
-
 @pytest.mark.parametrize("expect", [4, None])
 async def test_all_vehicles_of_a_time_or_an_expected_number_are_found(expect: int | None) -> None:
+    """Four vehicles, heard one after the other, and a camera of the first."""
     began = simulated_time_loop().now
-    async with a_client(fleet()) as client:
+    vehicles = [Late(small_px4(system=number), 0.7 * number) for number in (1, 2, 3, 4)]
+    async with a_client(Air([*vehicles, generic(system=1, component=100)])) as client:
         found = await client.find_autopilots(expect=expect)
         assert [each.system for each in found] == [1, 2, 3, 4]
         waited = simulated_time_loop().now - began
