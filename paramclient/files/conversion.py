@@ -7,9 +7,9 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import PurePath
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from paramclient.errors import FileError, PackError, UsageError
 from paramclient.files import json_format, lists
@@ -30,8 +30,7 @@ Content: TypeAlias = ParamFile | ParamSet | Iterable[ParamSet]
 """Content to write: a file as read, the parameters of one component, or of several."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Format:
+class _Format(NamedTuple):
     """How a format is read and written.
 
     Attributes:
@@ -164,8 +163,6 @@ def _read(reading: Reading, file_format: FileFormat | str | None) -> ParamFile:
     given = None if file_format is None else FileFormat(file_format)
     if len(reading.data) > LARGEST_FILE:
         raise FileError(f"a parameter file has at most {LARGEST_FILE} bytes", source=reading.source)
-    if not reading.data:
-        raise FileError("the file is empty", source=reading.source)
     try:
         chosen = given or _format_of(reading)
         return _FORMATS[chosen].read(reading, chosen)
@@ -329,35 +326,32 @@ _BYTES: Final = (
     (b"PK\x03\x04", "a compressed file (zip); unpack it first"),
 )
 """What files that begin with these bytes are."""
-_TEXTS: Final = tuple(
-    (re.compile(pattern, re.IGNORECASE | re.MULTILINE), kind)
-    for pattern, kind in (
-        (r"\A\s*<(?:!doctype html|html)", "a page of HTML; download the file itself"),
-        (r"\A(?s:.{,999})<paramfile\b", "metadata of parameters without values, which goes with --metadata"),
-        (r"\A\s*<(?:\?xml|!--|\w+[ >])", "XML"),
-        (
-            r'\A\s*\{(?s:.*?)"(?:shortDesc|DisplayName|metadataTypes)"\s*:',
-            "metadata of parameters without values (JSON), which goes with --metadata",
-        ),
-        (r'"fileType"\s*:\s*"Plan"', "a plan of QGroundControl (JSON): a mission, without parameters"),
-        (
-            r"^Symbols: x = used|^[x ] [ +*] \w+ \[[0-9]+,[0-9]+\] : ",
-            "the output of `param show` of PX4's console; save the parameters with a ground station",
-        ),
-        (
-            rf"{_TOP}[0-9]+[ \t]+[0-9]+[ \t]+[A-Za-z]\w*[ \t]+{_NUMBER}\s*$",
-            "a list with four columns, of an old QGroundControl: it has no type column",
-        ),
-        (
-            r"^[ \t]*param[ \t]+(?:set|set-default|greater|compare)\s",
-            "a start script of PX4, whose values depend on the vehicle",
-        ),
-        (r"\A#!.*sh\b|^[ \t]*\.[ \t]+\$\{R\}", "a script that sets no parameter; it may call another script"),
-        (
-            rf"{_TOP}(?:\w+[ \t,]+{_NUMBER}(?:[ \t]+[-+.0-9]|,[-+0-9]*\.).*\n){{2}}",
-            "a list with a third column, perhaps of defaults; remove it",
-        ),
-    )
+_TEXTS: Final = (
+    (r"\A\s*<(?:!doctype html|html)", "a page of HTML; download the file itself"),
+    (r"\A(?s:.{,999})<paramfile\b", "metadata of parameters without values, which goes with --metadata"),
+    (r"\A\s*<(?:\?xml|!--|\w+[ >])", "XML"),
+    (
+        r'\A\s*\{(?s:.*?)"(?:shortDesc|DisplayName|metadataTypes)"\s*:',
+        "metadata of parameters without values (JSON), which goes with --metadata",
+    ),
+    (r'"fileType"\s*:\s*"Plan"', "a plan of QGroundControl (JSON): a mission, without parameters"),
+    (
+        r"^Symbols: x = used|^[x ] [ +*] \w+ \[[0-9]+,[0-9]+\] : ",
+        "the output of `param show` of PX4's console; save the parameters with a ground station",
+    ),
+    (
+        rf"{_TOP}[0-9]+[ \t]+[0-9]+[ \t]+[A-Za-z]\w*[ \t]+{_NUMBER}\s*$",
+        "a list with four columns, of an old QGroundControl: it has no type column",
+    ),
+    (
+        r"^[ \t]*param[ \t]+(?:set|set-default|greater|compare)\s",
+        "a start script of PX4, whose values depend on the vehicle",
+    ),
+    (r"\A#!.*sh\b|^[ \t]*\.[ \t]+\$\{R\}", "a script that sets no parameter; it may call another script"),
+    (
+        rf"{_TOP}(?:\w+[ \t,]+{_NUMBER}(?:[ \t]+[-+.0-9]|,[-+0-9]*\.).*\n){{2}}",
+        "a list with a third column, perhaps of defaults; remove it",
+    ),
 )
 """What texts in which these patterns are found are. The first one counts."""
 
@@ -372,4 +366,5 @@ def kind_of(data: bytes) -> str | None:
     if data[8:9] in (b"\xfd", b"\xfe") and b"\0" in data[:BEGIN_SIZE]:
         return "a telemetry log (.tlog), which goes as replay:FILE"
     text = data[:BEGIN_SIZE].decode("utf-8", "replace")
-    return next((kind for pattern, kind in _TEXTS if pattern.search(text)), None)
+    flags = re.IGNORECASE | re.MULTILINE
+    return next((kind for pattern, kind in _TEXTS if re.search(pattern, text, flags)), None)

@@ -30,15 +30,6 @@ class FileFormat(NamedChoice):
     """paramclient's own format: all fields of every parameter, exactly."""
 
 
-class LogFormat(StrEnum):
-    """Formats of on-board logs, which `paramclient.logs` reads. None of them can be written."""
-
-    DATAFLASH = "dataflash"
-    """ArduPilot, `.bin`."""
-    ULOG = "ulog"
-    """PX4, `.ulg`."""
-
-
 ENDINGS: Final = {
     ".params": FileFormat.QGC,
     ".parm": FileFormat.PARM,
@@ -72,7 +63,7 @@ class ParamFile:
 
     Attributes:
         sets: the parameters, one set per component, in the order of the file.
-        file_format: the format.
+        file_format: the format; of an on-board log, that of the log, which cannot be written.
         source: the file's name, as given.
         header: the comment lines at the top, without comment characters.
         footer: the comment lines after the last parameter. All others belong to the parameter below them.
@@ -81,7 +72,7 @@ class ParamFile:
     """
 
     sets: tuple[ParamSet, ...]
-    file_format: FileFormat | LogFormat
+    file_format: StrEnum
     source: str = ""
     header: tuple[str, ...] = ()
     footer: tuple[str, ...] = ()

@@ -53,7 +53,6 @@ VERSION: Final = 1
 """Version of documents, written and required."""
 _KEY: Final = "paramclient"
 """The key with the version."""
-_NUMBER_EXPECTED: Final = "expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
 _CUSTOM: Final = ParamType.CUSTOM
 _TYPES: Final = TYPES_BY_NAME | {_CUSTOM.name: _CUSTOM}
 _WORDS: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
@@ -267,7 +266,8 @@ def _number(content: object) -> Value:
         if not math.isinf(content):
             return content
         raise UsageError("the number is beyond the range of a double")
-    raise UsageError(f"{_NUMBER_EXPECTED}{_found(content)}")
+    number = "a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
+    raise UsageError(f"expected {number}{_found(content)}")
 
 
 def _custom(content: object) -> Value:

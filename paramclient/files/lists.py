@@ -16,6 +16,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePath
 from typing import Final, TypeAlias
@@ -83,7 +84,7 @@ def read_pairs(reading: Reading, file_format: FileFormat) -> ParamFile:
 
 def pair_line(separator: str, params: ParamSet, param: WrittenParam) -> str:
     """Return the line of a parameter, or raise UsageError if the format cannot express it."""
-    return f"{_writable_name(param)}{separator}{value_text(param)}"
+    return f"{check_portable_name(param.name)}{separator}{value_text(param)}"
 
 
 class _Pairs:
@@ -115,12 +116,7 @@ class _Pairs:
         value = self._number(line, words, source)
         if value is None:
             return
-        try:
-            check_portable_name(words[0])
-        except UsageError as error:
-            self._reading.bad_line(
-                line, f"{self._expected} with a parameter's name ({error})", source, is_name=True
-            )
+        if not self._reading.has_name(line, words[0], f"{self._expected} with a parameter's name", source):
             return
         number = None if chain else line.number
         place = f"{source}:{line.number}" if chain else f"line {line.number}"
@@ -147,8 +143,7 @@ class _Pairs:
         try:
             self._read_included(path, source, chain)
         except UsageError as error:
-            what = f"@include with a file that can be read ({error})"
-            self._reading.bad_line(line, what, source)
+            self._reading.bad_line(line, f"@include with a file that can be read ({error})", source)
             return
         if self._reading.fault_count > before:
             self._reading.fault(line.number, "includes that file", source=source)
@@ -206,11 +201,7 @@ def read_qgc(reading: Reading, file_format: FileFormat) -> ParamFile:
         except UsageError as error:
             reading.bad_line(line, str(error))
             return
-        try:
-            check_portable_name(name)
-        except UsageError as error:
-            reading.bad_line(line, f"a parameter's name in the third column ({error})", is_name=True)
-        else:
+        if reading.has_name(line, name, "a parameter's name in the third column"):
             reading.add(param, f"line {line.number}", system, component)
 
     return reading.file(file_format, *_read_commented_lines(reading.text, reading, take))
@@ -227,7 +218,7 @@ def write_qgc(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
         systems = ", ".join(str(each) for each in dict.fromkeys(params.system for params in sets))
         header = [f"Onboard parameters for Vehicle {systems}", "", *header, *([""] if header else [])]
         header.append(_QGC_COLUMNS)
-    return write_list(qgc_line, sets, around, header)
+    return write_list(qgc_line, sets, replace(around, header=tuple(header)))
 
 
 def qgc_line(params: ParamSet, param: WrittenParam) -> str:
@@ -242,7 +233,8 @@ def qgc_line(params: ParamSet, param: WrittenParam) -> str:
     text = value_text(param)
     if isinstance(param.value, float) and not math.isfinite(param.value):
         text = text.lower().removesuffix("inity")  # Qt's notation
-    return f"{params.system}\t{component}\t{_writable_name(param)}\t{text}\t{int(param.type)}"
+    name = check_portable_name(param.name)
+    return f"{params.system}\t{component}\t{name}\t{text}\t{int(param.type)}"
 
 
 def _whole(text: str, low: int, high: int, expected: str) -> int:
@@ -271,10 +263,7 @@ def _fitting(value: int | float, kind: ParamType) -> Value:
 
 
 def write_list(
-    line_of: Callable[[ParamSet, WrittenParam], str],
-    sets: Sequence[ParamSet],
-    around: ParamFile,
-    header: Sequence[str] | None = None,
+    line_of: Callable[[ParamSet, WrittenParam], str], sets: Sequence[ParamSet], around: ParamFile
 ) -> Iterator[str]:
     """Generate the lines of a file, so that reading it gives the same header, comments and footer.
 
@@ -282,9 +271,8 @@ def write_list(
         line_of: returns the line of a parameter, or raises UsageError.
         sets: the parameters.
         around: for header and footer.
-        header: the header in place of that of `around`.
     """
-    yield from comment_lines(around.header if header is None else header)
+    yield from comment_lines(around.header)
     rows = ((params, param) for params in sets for param in params.values())
     for place, (params, param) in enumerate(rows):
         if param.comment:
@@ -300,14 +288,14 @@ def _read_commented_lines(text: str, reading: Reading, take: Callable[[TextLine,
 
     The header is the comments above the first parameter, up to the last empty line if there is one.
     """
-    header: list[str] = []
+    header: list[str] | None = None
     waiting: list[str] = []
-    at_top, has_gap = True, False
+    at_top = True
     for line in lines_of(text):
         if line.is_foreign:
             reading.foreign.append(f"line {line.number}")
         if line.text:
-            if at_top and not has_gap:
+            if at_top and header is None:
                 header, waiting = waiting, []
             at_top = False
             if line.comment:
@@ -317,14 +305,5 @@ def _read_commented_lines(text: str, reading: Reading, take: Callable[[TextLine,
         elif line.comment is not None:
             waiting.append(line.comment)
         elif at_top:
-            has_gap = True
-            header += waiting
-            waiting = []
-    return tuple(header), tuple(waiting)
-
-
-def _writable_name(param: WrittenParam) -> str:
-    """Return the name if a line can contain it; else raise UsageError."""
-    if not is_portable_name(param.name):
-        raise UsageError(f"the name {param.name!r} cannot be written in this format; json keeps it")
-    return param.name
+            header, waiting = [*(header or []), *waiting], []
+    return tuple(header or []), tuple(waiting)

@@ -15,7 +15,7 @@ from paramclient.files.formats import FileFormat, ParamFile
 from paramclient.model.names import first_of
 from paramclient.model.notation import value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, bits_of, format_value, from_bits
+from paramclient.model.values import ParamType, Value, bits_of, check_portable_name, format_value, from_bits
 
 FAULTS_MAX: Final = 20
 """Bad lines that an error lists: in a file of another kind, every line is bad."""
@@ -102,6 +102,15 @@ class Reading:
         if not self.is_full:
             self._faults.append((source or self.source, line, what))
         self.fault_count += 1
+
+    def has_name(self, line: TextLine, name: str, expected: str, source: str = "") -> bool:
+        """Return whether a vehicle can have the name in a line; else add the line."""
+        try:
+            check_portable_name(name)
+        except UsageError as error:
+            self.bad_line(line, f"{expected} ({error})", source, is_name=True)
+            return False
+        return True
 
     def bad_line(self, line: TextLine, expected: str, source: str = "", *, is_name: bool = False) -> None:
         """Add a line that has other content than expected."""
@@ -209,8 +218,7 @@ def decode_text(data: bytes, source: str) -> str:
         raise FileError(f"expected UTF-16 text, found {found}", source=source) from None
     if control := _control.search(text):
         line = text.count("\n", 0, control.start()) + 1
-        found = f"the character 0x{ord(control[0]):02x}"
-        message = f"expected text, found {found}: unknown file format"
+        message = f"expected text, found the character 0x{ord(control[0]):02x}: unknown file format"
         raise FileError(message, source=source, line=line)
     return text
 

@@ -17,9 +17,9 @@ import anyio.to_thread
 from paramclient.cache import ParamCache, StoredParam, TableUpdate
 from paramclient.client.cache_writer import TableRecord, update_of
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import AUTOPILOT, LogFormat
+from paramclient.files.formats import AUTOPILOT
 from paramclient.links.tlog import LOG_PEER, Record, open_log, read_records
-from paramclient.logs.onboard import OnboardLog, read_onboard_log
+from paramclient.logs.onboard import LogFormat, OnboardLog, read_onboard_log
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType

@@ -15,16 +15,27 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import AUTOPILOT, LogFormat
+from paramclient.files.formats import AUTOPILOT
 from paramclient.metadata.store import ARDUPILOT, OLD_NAMES
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, check_name, is_portable_name, shortest_float
 from paramclient.wire.messages import MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4
+
+
+class LogFormat(StrEnum):
+    """Formats of on-board logs. None of them can be written."""
+
+    DATAFLASH = "dataflash"
+    """ArduPilot, `.bin`."""
+    ULOG = "ulog"
+    """PX4, `.ulg`."""
+
 
 LOG_MAGICS: Final = {b"ULog\x01\x12\x35": LogFormat.ULOG, b"\xa3\x95": LogFormat.DATAFLASH}
 """The first bytes of a ULog file, and of each message of a dataflash log."""

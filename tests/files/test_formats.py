@@ -352,7 +352,7 @@ def test_an_error_lists_at_most_twenty_bad_lines() -> None:
 @pytest.mark.parametrize(
     ("data", "problem", "line"),
     [
-        (b"", "the file is empty", None),
+        (b"", "contains no parameters", None),
         (b"# only a comment\n", "contains no parameters", None),
         (b"A 1\nB \xff\n", "expected UTF-8 text, found the byte 0xff", 2),
         (b"\x1f\x8b\x08\x00", "not a parameter file: a compressed file (gzip)", None),
@@ -469,8 +469,8 @@ CAMERA = params_of(WrittenParam("A", 1, ParamType.INT8), component=100)
         ([params_of(WrittenParam("A", 1))], "qgc", "A has no type that MAVLink defines"),
         ([replace(CAMERA, system=None)], "qgc", "the set has none: give it one"),
         ([params_of(WrittenParam("A", 1))], "pck", "A has no type, and a packed file holds INT8, INT16"),
-        ([params_of(WrittenParam("A B", 1))], "parm", "the name 'A B' cannot be written in this format"),
-        ([params_of(WrittenParam("A#", 1, ParamType.INT8))], "qgc", "the name 'A#' cannot be written"),
+        ([params_of(WrittenParam("A B", 1))], "parm", "'A B': no parameter file can hold it"),
+        ([params_of(WrittenParam("A#", 1, ParamType.INT8))], "qgc", "'A#': no parameter file can hold it"),
         ([params_of(WrittenParam("A", 300, ParamType.INT8))], "json", "300 does not fit INT8"),
         (
             [params_of(WrittenParam("A", from_bits(0x7FC12345, ParamType.REAL32)))],
