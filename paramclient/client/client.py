@@ -50,6 +50,8 @@ LISTENING_TIME: Final = HEARTBEAT_WAIT
 SILENT_TIME: Final = 2.95
 """Seconds from the begin for a component that has never answered a request, where another one on the link
 answers: it costs no more than 3 s."""
+EVENTS_MAX: Final = 1_000
+"""Queued events for a consumer, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +80,7 @@ class Event:
 class Events(Stream[Event]):
     """Stream of the component events since its creation; see `ParamClient.events`."""
 
-    most = 1_000
+    most = EVENTS_MAX
 
 
 class ParamClient:
