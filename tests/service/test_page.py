@@ -22,6 +22,12 @@ PHONE: Any = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_
 TIMEOUT = 60_000.0
 EXPECTED = re.compile(r"the server responded with a status of (4\d\d|503)|ERR_(CONNECTION_|INCOMPLETE)")
 """What the browser itself says of answers that are problems, and of a service that is gone."""
+SCROLLED = """grid => new Promise(done => {
+    const drawn = () => requestAnimationFrame(() => requestAnimationFrame(done));
+    grid.addEventListener("scroll", drawn, {once: true});
+    grid.scrollTop = 4000;
+})"""
+"""Scrolls, and returns when the rows there have been drawn: a press between the two would be beside them."""
 
 expect.set_options(timeout=TIMEOUT)
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium is here: apt install chromium")
@@ -177,7 +183,7 @@ def test_a_press_before_the_rows_are_sorted_is_a_click(bench: Bench, sight: Sigh
     cell = sight.page.locator("#rows .row .value").nth(5).bounding_box()
     assert cell is not None
     sight.page.mouse.move(cell["x"] + 5, cell["y"] + 5)
-    sight.grid.evaluate("grid => { grid.scrollTop = 4000; }")
+    sight.grid.evaluate(SCROLLED)
     sight.page.mouse.down()
     sight.page.wait_for_timeout(300)
     sight.page.mouse.up()
