@@ -289,10 +289,8 @@ def _check(sets: Sequence[ParamSet], file_format: FileFormat) -> None:
     if not sets:
         raise UsageError("there are no parameters to write")
     if len(sets) > 1 and file_format not in _SEVERAL:
-        components = ", ".join(map(address, sets))
-        raise UsageError(
-            f"the format {file_format} holds one component, and there are {components}; choose one"
-        )
+        there = ", ".join(map(address, sets))
+        raise UsageError(f"the format {file_format} holds one component, and there are {there}; choose one")
     seen = set()
     for each in sets:
         check_ids(each.system, each.component)
@@ -302,11 +300,11 @@ def _check(sets: Sequence[ParamSet], file_format: FileFormat) -> None:
         if ids in seen:  # nothing distinguishes the two
             raise UsageError(f"two sets have the same component, {address(each)}")
         seen.add(ids)
-    if any(each.is_extended for each in sets):
-        if file_format is not FileFormat.JSON:
-            raise UsageError(f"the format {file_format} cannot hold extended parameters; write .json")
-        if not all(each.is_extended for each in sets):
-            raise UsageError("a file has either plain or extended parameters, not both")
+    extended = {each.is_extended for each in sets}
+    if True in extended and file_format is not FileFormat.JSON:
+        raise UsageError(f"the format {file_format} cannot hold extended parameters; write .json")
+    if len(extended) > 1:
+        raise UsageError("a file has either plain or extended parameters, not both")
 
 
 # Files that are no parameter files, although they are mistaken for them
@@ -321,19 +319,16 @@ _BYTES: Final = (
     (b"SQLite format 3\0", "an SQLite database"),
     (b"ULog\x01\x12\x35", "an on-board log of PX4 (ULog)"),
     (b"\xa3\x95", "an on-board log of ArduPilot (dataflash)"),
-    (b"\xfd7zXZ\0", "a compressed file (xz); unpack it first"),
-    (b"\x1f\x8b", "a compressed file (gzip); unpack it first"),
-    (b"PK\x03\x04", "a compressed file (zip); unpack it first"),
+    ((b"\xfd7zXZ\0", b"\x1f\x8b", b"PK\x03\x04"), "a compressed file; unpack it first"),
 )
 """What files that begin with these bytes are."""
 _TEXTS: Final = (
     (r"\A\s*<(?:!doctype html|html)", "a page of HTML; download the file itself"),
-    (r"\A(?s:.{,999})<paramfile\b", "metadata of parameters without values, which goes with --metadata"),
-    (r"\A\s*<(?:\?xml|!--|\w+[ >])", "XML"),
     (
-        r'\A\s*\{(?s:.*?)"(?:shortDesc|DisplayName|metadataTypes)"\s*:',
-        "metadata of parameters without values (JSON), which goes with --metadata",
+        r'\A(?s:.{,999})<paramfile\b|\A\s*\{(?s:.*?)"(?:shortDesc|DisplayName|metadataTypes)"\s*:',
+        "metadata of parameters without values, which goes with --metadata",
     ),
+    (r"\A\s*<(?:\?xml|!--|\w+[ >])", "XML"),
     (r'"fileType"\s*:\s*"Plan"', "a plan of QGroundControl (JSON): a mission, without parameters"),
     (
         r"^Symbols: x = used|^[x ] [ +*] \w+ \[[0-9]+,[0-9]+\] : ",

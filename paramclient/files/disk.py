@@ -81,10 +81,9 @@ def _named_errors(source: str, done: str) -> Iterator[None]:
 
 def _sync_folder(folder: Path) -> None:
     """Flush the new directory entry to disk. Ignores errors, as the file has been replaced already."""
-    if sys.platform != "win32":  # Windows cannot open a folder
-        with suppress(OSError):
-            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+    with suppress(OSError):  # Windows cannot open a folder
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

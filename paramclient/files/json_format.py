@@ -266,8 +266,7 @@ def _number(content: object) -> Value:
         if not math.isinf(content):
             return content
         raise UsageError("the number is beyond the range of a double")
-    number = "a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
-    raise UsageError(f"expected {number}{_found(content)}")
+    raise UsageError(f"expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes){_found(content)}")
 
 
 def _custom(content: object) -> Value:

@@ -78,8 +78,7 @@ def read_pairs(reading: Reading, file_format: FileFormat) -> ParamFile:
         FileError: a line is something else, also in an included file.
     """
     expected = "NAME,VALUE" if file_format is FileFormat.MISSION_PLANNER else "NAME VALUE"
-    pairs = _Pairs(reading, expected)
-    return reading.file(file_format, *pairs.read(reading.text, reading.source, ()))
+    return reading.file(file_format, *_Pairs(reading, expected).read(reading.text, reading.source, ()))
 
 
 def pair_line(separator: str, params: ParamSet, param: WrittenParam) -> str:
@@ -114,9 +113,8 @@ class _Pairs:
             comment = f"{comment}\n@READONLY" if comment else "@READONLY"
             words.pop()
         value = self._number(line, words, source)
-        if value is None:
-            return
-        if not self._reading.has_name(line, words[0], f"{self._expected} with a parameter's name", source):
+        expected = f"{self._expected} with a parameter's name"
+        if value is None or not self._reading.has_name(line, words[0], expected, source):
             return
         number = None if chain else line.number
         place = f"{source}:{line.number}" if chain else f"line {line.number}"
@@ -196,12 +194,13 @@ def read_qgc(reading: Reading, file_format: FileFormat) -> ParamFile:
         name = columns[2]
         try:
             system, component = _whole(columns[0], 1, 255, _QGC_IDS), _whole(columns[1], 0, 255, _QGC_IDS)
-            kind, value = ParamType(_whole(columns[4], 1, 10, _QGC_TYPE)), _qgc_value(columns[3])
-            param = WrittenParam(name, _fitting(value, kind), kind, comment=comment, line=line.number)
+            kind = ParamType(_whole(columns[4], 1, 10, _QGC_TYPE))
+            value = _qgc_value(columns[3], kind)
         except UsageError as error:
             reading.bad_line(line, str(error))
             return
         if reading.has_name(line, name, "a parameter's name in the third column"):
+            param = WrittenParam(name, value, kind, comment=comment, line=line.number)
             reading.add(param, f"line {line.number}", system, component)
 
     return reading.file(file_format, *_read_commented_lines(reading.text, reading, take))
@@ -224,9 +223,7 @@ def write_qgc(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
 def qgc_line(params: ParamSet, param: WrittenParam) -> str:
     """Return the line of a parameter, or raise UsageError if the format cannot express it."""
     if params.system is None:
-        raise UsageError(
-            "this format needs the system id of each parameter, and the set has none: give it one"
-        )
+        raise UsageError("the format needs a system id for each parameter, and the set has none: give it one")
     if not isinstance(param.type, ParamType):
         raise UsageError(f"{param.name} has no type that MAVLink defines, and this format needs one")
     component = AUTOPILOT if params.component is None else params.component
@@ -244,17 +241,13 @@ def _whole(text: str, low: int, high: int, expected: str) -> int:
     return number
 
 
-def _qgc_value(text: str) -> int | float:
+def _qgc_value(text: str, kind: ParamType) -> Value:
     number = math.nan if _qgc_nan(text) else parse_number(text)
     if number is None:
         comma = " with a decimal point" if "," in text else ""
         raise UsageError(f"a number{comma} in the fourth column")
-    return number
-
-
-def _fitting(value: int | float, kind: ParamType) -> Value:
     try:
-        return as_type(value, kind)
+        return as_type(number, kind)
     except UsageError as error:
         raise UsageError(f"a value that its type can hold ({error})") from None
 
