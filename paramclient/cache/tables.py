@@ -213,6 +213,8 @@ def save_table(tx: Transaction, update: TableUpdate, now: float) -> None:
     before = find_table(tx, update.identity.key, update.component, extended=update.extended)
     owner = _upsert_table(tx, update, horizon).owner
     names = {item.name for item in update.params}
+    if update.table and not update.table.volatile_known and any(item.volatile for item in update.params):
+        tx.do("UPDATE parameter SET volatile = 0 WHERE owner = ?", (owner,))  # it was learnt anew which are
     is_all = update.replace or len(names) > NAMES_SELECTED_MAX
     rows = load_rows(tx, owner, None if is_all else names)
     gone = [name for name, row in rows.items() if row.stored and name not in names] if update.replace else []

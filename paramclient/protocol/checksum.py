@@ -33,10 +33,10 @@ from paramclient.protocol.table import Table
 
 CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
-AT_ONCE: Final = 4
-"""Requests sent at once: of five, a Plane and a Rover lose the next one within 10 ms (measured)."""
-INTERVAL_FIRST: Final = 0.012
-"""Seconds from these to the next request."""
+AT_ONCE: Final = 5
+"""Requests sent at once: ArduPilot queues no more of them (GCS_FTP.cpp)."""
+INTERVAL_FIRST: Final = 0.020
+"""Seconds from these to the next request: a Plane and a Rover look for requests every 20 ms."""
 OUTDATED: Final = 0.1
 """Seconds after which a checksum is requested again with the next ones: a pressure changes every second."""
 INTERVAL: Final = 0.006
@@ -65,6 +65,8 @@ PASSED_MAX: Final = 86_400.0
 MEASURED_ONCE: Final = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|ARSPD\d?_OFFSET|COMPASS_DEC")
 MEASURED: Final = re.compile(f"{MEASURED_ONCE.pattern}|{PRESSURE.pattern}")
 """Names that each start of the vehicle measures again (measured)."""
+OFTEN_MAX: Final = 8
+"""Values changed at once that may have moved by themselves: of more, somebody has changed them."""
 TOO_MANY: Final = "it differs, and a download is quicker than a search for the changes"
 OTHER: Final = "the vehicle has other parameters than the cached table, or changes them all the time"
 PROOFS_MAX: Final = 2
@@ -155,10 +157,8 @@ class _Proof:
         often = {at for at, row in enumerate(rows) if row.name in volatile} - always - seconds
         rare = {at for at, row in enumerate(rows) if row.name == BOOT_COUNT or may_be_rounded(row)}
         suspects: set[int] = set()
-        numbers = self._ends_of(always, whole)
-        if self._is_slow:
-            numbers |= {1} | self._ends_of(often, whole)  # 1 shows another number of parameters by its header
-        await self._request({len(whole), *numbers})
+        numbers = {len(whole)} | self._ends_of(always, whole)
+        await self._request(numbers | {1} if self._is_slow else numbers)  # 1: its header has the count
         while places := self._places():
             if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
                 suspects = {at for at in whole if MEASURED.fullmatch(rows[at].name) and rows[at].bits}
@@ -364,8 +364,8 @@ class _Proof:
             table.store_entry(row._replace(default=bits), at, moment, with_defaults=False)
         if _rows(table) != self._rows:
             return False
-        if self._changed:
-            names = {self._rows[at].name for at in self._changed}
+        names = {self._rows[at].name for at in self._changed}
+        if names and len(names) <= OFTEN_MAX:
             table.volatile = frozenset(name for name in names if not MEASURED_ONCE.fullmatch(name))
         table.prove(self._found[len(self._rows)])
         return True

@@ -270,6 +270,19 @@ async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_compute
     assert history(path, "PARAM_01") == [("PARAM_01", 1, 100, "us"), ("PARAM_01", 100, 101, "us")]
 
 
+async def test_a_search_takes_no_longer_for_what_was_changed_before(path: Path) -> None:
+    """Somebody else changes two other values before each session: they do not move by themselves."""
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    await session(vehicle, path)
+    asked = []
+    for tuned in range(1, 17, 2):
+        vehicle.load({f"SERVO{tuned}_MIN": 1111, f"RC{tuned}_DZ": 33})
+        tap = Tap(vehicle)
+        assert (await session(tap, path)).source == "cache"
+        asked.append(len(tap.messages(messages.FileTransfer)))
+    assert max(asked[4:]) <= max(asked[:4]), asked
+
+
 async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(path: Path) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
