@@ -238,12 +238,12 @@ def warm_rows() -> Iterator[Row]:
     for name, conditions, change, median, worst, most in (
         ("unchanged", CLEAN, None, 0.05, 0.05, 600),
         ("run time passed", CLEAN, pass_run_time, 0.05, 0.05, 600),
-        ("after a restart", CLEAN, restart, 0.4, 0.4, 3000),
         ("two values changed", CLEAN, change_two, 0.3, 0.3, 3000),
         ("unchanged, 100 ms", slow, None, 0.3, 0.3, None),
         ("two values changed, 100 ms", slow, change_two, 0.72, 0.72, None),  # the time of the file
         ("unchanged, 20% lost", replace(slow, loss=0.2), None, 0.7, 2.0, None),
         ("unchanged, 57600 baud", RADIO, None, 0.8, 0.8, None),
+        ("after a restart", CLEAN, restart, 0.4, 0.4, 3000),  # last: it measures its pressure anew later
     ):
         measure = partial(time_warm_start, conditions=conditions, change=change)
         yield Row(f"ArduPilot warm, {name}", "ardupilot", measure, median, worst, 0.0, most)
