@@ -259,7 +259,7 @@ class SqliteStore(Store):
         super().__init__(str(path))
         self._path = path
         self._file: tuple[int, int] | None = None  # device and inode of the open file
-        self._is_read_only = False  # whether the file is opened as one that nobody writes
+        self._is_read_only = False  # whether the open file counts as one that nobody writes
 
     def _transact(self, work: Callable[[Transaction], T], *, writing: bool, durable: bool) -> T:
         if self._file is not None and self._which() != self._file:  # deleted, renamed or replaced
@@ -268,9 +268,8 @@ class SqliteStore(Store):
             self.replacements += 1
         if not writing and not self._path.exists():
             return _read_nothing(work)
-        if writing and self._is_read_only:
+        if self._is_read_only:  # another process may have written since
             self._drop()
-            self._is_read_only = False
         if self._connection is None:
             self._connection = self._open(writing=writing)
         connection = self._connection
@@ -300,10 +299,8 @@ class SqliteStore(Store):
                 return
             case _Unusable():
                 self._set_aside(str(error))
-            case sqlite3.DatabaseError() if code & 0xFF in _DAMAGE:
+            case sqlite3.DatabaseError() if code & 0xFF in _DAMAGE and not self._is_read_only:
                 self._set_aside("damaged")
-            case sqlite3.DatabaseError() if code in _UNWRITABLE and not writing and not self._is_read_only:
-                self._is_read_only = True
             case sqlite3.DatabaseError() | OSError():
                 cause = _CAUSES.get(code, error)
                 raise CacheError(f"the cache {self.place} cannot be used: {cause}") from error
@@ -320,9 +317,11 @@ class SqliteStore(Store):
             self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             os.close(os.open(self._path, os.O_RDWR | os.O_CREAT, 0o600))
         self._file = self._which()
-        if self._is_read_only:
-            return _connect(f"{self._path.as_uri()}?mode=ro&immutable=1")
         connection = _connect(f"{self._path.as_uri()}?mode=rw")
+        self._is_read_only = not writing and _is_unwritable(connection)
+        if self._is_read_only:
+            connection.close()
+            return _connect(f"{self._path.as_uri()}?mode=ro&immutable=1")
         connection.execute("PRAGMA foreign_keys = ON")
         connection.execute("PRAGMA synchronous = NORMAL")
         if writing:
@@ -378,6 +377,14 @@ def _connect(uri: str) -> sqlite3.Connection:
     return sqlite3.connect(
         uri, uri=True, timeout=LOCK_WAIT_MAX, isolation_level=None, check_same_thread=False
     )
+
+
+def _is_unwritable(connection: sqlite3.Connection) -> bool:
+    try:
+        connection.execute("PRAGMA user_version").fetchall()
+    except sqlite3.OperationalError as error:
+        return error.sqlite_errorcode in _UNWRITABLE
+    return False
 
 
 def _switch_to_wal(connection: sqlite3.Connection) -> None:

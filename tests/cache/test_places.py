@@ -16,8 +16,12 @@ from paramclient.errors import CacheError, UsageError
 from tests.cache.conftest import Open
 from tests.caches import (
     CACHE_ALONE,
+    NOW,
+    read_only,
     rubbish,
     set_aside,
+    stored,
+    update,
     values,
     whole_table,
 )
@@ -108,6 +112,15 @@ def test_a_place_that_cannot_be(tmp_path: Path) -> None:
         cache.save(whole_table(1))
     with pytest.raises(UsageError, match="not valid"):
         ParamCache("postgresql://a b")
+
+
+def test_a_reader_that_may_not_write_sees_what_is_written_later(path: Path) -> None:
+    with ParamCache(filled(path)) as reader:
+        with read_only(path.parent):
+            assert values(reader)["PARAM_0"] == 0
+        with ParamCache(path) as other:
+            other.save(update(stored("PARAM_0", 5, at=NOW + 1), at=NOW + 1))
+        assert values(reader)["PARAM_0"] == 5
 
 
 # several processes
