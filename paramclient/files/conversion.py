@@ -15,7 +15,7 @@ from paramclient.errors import FileError, PackError, UsageError
 from paramclient.files import json_format, lists
 from paramclient.files.disk import LARGEST_FILE, read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, format_of_name
-from paramclient.files.reading import Reading
+from paramclient.files.reading import UTF16_MARKS, Reading
 from paramclient.model.identity import autopilot_name, check_ids, version_text
 from paramclient.model.names import counted, first_of
 from paramclient.model.notation import time_text
@@ -323,7 +323,7 @@ _BYTES: Final = (
 )
 """What files that begin with these bytes are."""
 _TEXTS: Final = (
-    (r"\A\s*<(?:!doctype html|html)", "a page of HTML; download the file itself"),
+    (r"\A\s*(?s:<.{,999})?<(?:!doctype html|html)", "a page of HTML; download the file itself"),
     (
         r'\A(?s:.{,999})<paramfile\b|\A\s*\{(?s:.*?)"(?:shortDesc|DisplayName|metadataTypes)"\s*:',
         "metadata of parameters without values, which goes with --metadata",
@@ -331,8 +331,8 @@ _TEXTS: Final = (
     (r"\A\s*<(?:\?xml|!--|\w+[ >])", "XML"),
     (r'"fileType"\s*:\s*"Plan"', "a plan of QGroundControl (JSON): a mission, without parameters"),
     (
-        r"^Symbols: x = used|^[x ] [ +*] \w+ \[[0-9]+,[0-9]+\] : ",
-        "the output of `param show` of PX4's console; save the parameters with a ground station",
+        r"^Symbols: x = used|^[x ] [ +*] \w+ \[[0-9]+,[0-9]+\] : |^BSON_\w+: ",
+        "the output of PX4's `param show` or `bsondump`; save the parameters with a ground station",
     ),
     (
         rf"{_TOP}[0-9]+[ \t]+[0-9]+[ \t]+[A-Za-z]\w*[ \t]+{_NUMBER}\s*$",
@@ -356,10 +356,11 @@ def kind_of(data: bytes) -> str | None:
     for magic, kind in _BYTES:
         if data.startswith(magic):
             return kind
-    if len(data) > 4 and int.from_bytes(data[:4], "little") == len(data) and data.endswith(b"\0"):
+    if re.match(rb"(?s:.{4})(?:[\x01\x10]\w{1,16}\0|\0\Z)", data):  # the size is 0 before PX4 1.12
         return "parameter storage of PX4 (BSON); save the parameters with a ground station"
     if data[8:9] in (b"\xfd", b"\xfe") and b"\0" in data[:BEGIN_SIZE]:
         return "a telemetry log (.tlog), which goes as replay:FILE"
-    text = data[:BEGIN_SIZE].decode("utf-8", "replace")
+    encoding = "utf-16" if data.startswith(UTF16_MARKS) else "utf-8-sig"
+    text = data[:BEGIN_SIZE].decode(encoding, "replace")
     flags = re.IGNORECASE | re.MULTILINE
     return next((kind for pattern, kind in _TEXTS if re.search(pattern, text, flags)), None)

@@ -23,6 +23,8 @@ EXCERPT_LENGTH_MAX: Final = 80
 """Characters of a bad line that an error shows, so that the error stays readable."""
 NUMBER_LENGTH_MAX: Final = 400
 """Characters of a number: the longest decimal form of a double without padding has fewer."""
+UTF16_MARKS: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+"""The byte order marks with which a text in UTF-16 begins."""
 
 _line_end: Final = re.compile(r"\r\n|\n|\r")
 _number: Final = re.compile(
@@ -210,7 +212,7 @@ def decode_text(data: bytes, source: str) -> str:
     Raises:
         FileError: the file is not text.
     """
-    is_utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    is_utf16 = data.startswith(UTF16_MARKS)
     try:
         text = data.decode("utf-16") if is_utf16 else data.decode("utf-8-sig", "surrogateescape")
     except UnicodeDecodeError as error:

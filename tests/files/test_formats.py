@@ -368,17 +368,21 @@ def test_other_files_are_rejected(data: bytes, problem: str, line: int | None) -
 # Files of other programs
 
 
-KINDS = {
-    "a page of HTML": "<!DOCTYPE html>\n<html><body>404</body></html>\n",
-    "the output of `param show`": "Symbols: x = used, + = saved\nx + CAL_ACC0_ID [1,2] : 1310988\n",
-    "four columns": "# MAV ID  COMPONENT ID\n1\t1\tACC_OFFS_X\t0.5\n1\t1\tARMING\t1\n",
-    "a plan of QGroundControl": '{"fileType":"Plan","version":1,"mission":{"items":[]}}\n',
-    "not a parameter file of paramclient (JSON)": '{"A": 1}',
-    "a start script of PX4": "#!/bin/sh\n. ${R}etc/init.d/rc.mc_defaults\nparam set-default MC_ROLL_P 6.5\n",
-    "a script that sets no parameter": "#!/bin/sh\n. ${R}etc/init.d-posix/airframes/4001_gz_x500\n",
-    "a list with a third column": "A 1 1\nB 2.5 3\n",
-    "parameter storage of PX4 (BSON)": b"\x14\0\0\0\x10MC_ROLL_P\0\1\0\0\0\0",
-}
+KINDS = [
+    ("a page of HTML", "<!DOCTYPE html>\n<html><body>404</body></html>\n"),
+    ("a page of HTML", "\ufeff<!-- saved -->\n<html>"),
+    ("a page of HTML", "<?xml version='1.0'?>\n<!DOCTYPE html>".encode("utf-16")),
+    ("the output of PX4's `param show`", "Symbols: x = used, + = saved\nx + CAL_ACC0_ID [1,2] : 1310988\n"),
+    ("the output of PX4's `param show` or `bsondump`", "BSON document size 774\nBSON_INT32:  A = 1\n"),
+    ("four columns", "# MAV ID  COMPONENT ID\n1\t1\tACC_OFFS_X\t0.5\n1\t1\tARMING\t1\n"),
+    ("a plan of QGroundControl", '{"fileType":"Plan","version":1,"mission":{"items":[]}}\n'),
+    ("not a parameter file of paramclient (JSON)", '{"A": 1}'),
+    ("a start script of PX4", "#!/bin/sh\n. ${R}etc/init.d/rc.mc_defaults\nparam set-default A 6.5\n"),
+    ("a script that sets no parameter", "#!/bin/sh\n. ${R}etc/init.d-posix/airframes/4001_gz_x500\n"),
+    ("a list with a third column", "A 1 1\nB 2.5 3\n"),
+    ("parameter storage of PX4 (BSON)", b"\x14\0\0\0\x10MC_ROLL_P\0\1\0\0\0\0"),
+    ("parameter storage of PX4 (BSON)", b"\0\0\0\0\x01MC_ROLL_P" + bytes(10) + b"\xff"),  # before 1.12
+]
 RECORDED = {
     "parameters.json": "not a parameter file: metadata of parameters",
     "apm.pdef.json": "not a parameter file: metadata of parameters",
@@ -392,7 +396,7 @@ RECORDED = {
 @pytest.mark.parametrize(
     ("data", "kind"),
     [
-        *((data, kind) for kind, data in KINDS.items()),
+        *((data, kind) for kind, data in KINDS),
         *((DATA / name, kind) for name, kind in RECORDED.items()),
     ],
 )
