@@ -51,7 +51,7 @@ def replace_file(source: str, data: bytes, new_mode: int | None = None) -> None:
             mode = target.stat().st_mode
             if not stat.S_ISREG(mode):
                 raise FileError("cannot be written: not a regular file", source=source)
-        temporary = target.with_name(f".{target.name[:200]}.{secrets.token_hex(8)}.tmp")
+        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.tmp")
         try:
             with temporary.open("xb") as file:
                 if mode is not None and sys.platform != "win32":

@@ -19,7 +19,7 @@ from paramclient.client.cache_writer import TableRecord, update_of
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import AUTOPILOT
 from paramclient.links.tlog import LOG_PEER, Record, open_log, read_records
-from paramclient.logs.onboard import LogFormat, OnboardLog, read_onboard_log
+from paramclient.logs.onboard import LogFormat, OnboardLog, printable_path, read_onboard_log
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import ParamType
@@ -78,7 +78,7 @@ async def import_log(path: str | os.PathLike[str], cache: ParamCache) -> tuple[I
         LinkError: the file cannot be read, or is not a telemetry log.
         CacheError: the cache cannot be written.
     """
-    name = f"replay:{await anyio.Path(path).resolve()}"
+    name = f"replay:{printable_path(path)}"
     with closing(open_log(os.fspath(path), name)) as file:
         introductions = await _first_introductions(read_records(file))
         file.seek(0)

@@ -135,7 +135,12 @@ def _format_of(path: Path) -> LogFormat | None:
 
 def _link(path: str) -> str:
     """Return the link name of a log, which is part of the identity of a vehicle without a hardware id."""
-    return f"log:{os.path.realpath(path)}"
+    return f"log:{printable_path(path)}"
+
+
+def printable_path(path: str | os.PathLike[str]) -> str:
+    """Return the absolute path of a file as text that a cache can store: its name may not be UTF-8."""
+    return os.fsencode(os.path.realpath(path)).decode(errors="backslashreplace")
 
 
 # Dataflash

@@ -40,6 +40,12 @@ def test_the_extension_selects_the_format_to_write(ending: str, form: FileFormat
     assert listed(tmp_path) == [path.name]
 
 
+def test_a_file_may_have_the_longest_name(tmp_path: Path) -> None:
+    path = tmp_path / f"{'é' * 124}.param"  # 254 bytes
+    write_file(path, PARAMS)
+    assert listed(tmp_path) == [path.name]
+
+
 @pytest.fixture
 def old(tmp_path: Path) -> Path:
     """A file that is there already, alone in its folder."""

@@ -179,7 +179,7 @@ def test_the_order_of_logs_does_not_matter(is_reversed: bool, tmp_path: Path) ->
     first = whole(A=1, B=2).wait(9.0).change("A", 3).wait(1.0).beat()
     second = Log(NOW + 1000.0).beat().identify()
     second.list(A=4, B=2).wait(10.0).change("B", 8).wait(1.0).beat()
-    logs = [first.write(tmp_path / "1.tlog"), second.write(tmp_path / "2.tlog")]
+    logs = [first.write(tmp_path / "1.tlog"), second.write(tmp_path / os.fsdecode(b"2\xe9.tlog"))]
     cache = tmp_path / "cache"
     imported(*(reversed(logs) if is_reversed else logs), cache=cache)
     assert kept_values(cache) == {"A": 4, "B": 8}
