@@ -348,15 +348,12 @@ class _Job:
             if now.row is not None:
                 arrived[now.row.name] = now.row
                 status.count(now.done, now.total)
-
-        async def announce() -> None:
-            await session.check_only()
-            if not session.options.json:
+            elif now.phase == "writing" and not (arrived or session.options.json):
                 say(f"writing to {session.receiver} on {session.client.link.name}")
 
-        self.found = Rows(arrived)
-        title, options = f"setting {session.label}", self.options
-        options |= {"timeout": session.deadline.left(), "progress": update, "before_writing": announce}
+        self.found, title = Rows(arrived), f"setting {session.label}"
+        options = self.options | {"timeout": session.deadline.left(), "progress": update}
+        options["before_writing"] = session.check_only
         with Status(f"{title}: waiting for the first response", title) as status:
             self.found = await run_apply(
                 session.component, state.params, options, is_restore=state.is_restore

@@ -262,6 +262,7 @@ class _Run:
             stages = self._pending_stages()
             for stage in stages:
                 await self._check_armed()
+                self._report("writing")
                 await self._write_stage(stage)
             if self._must_reboot(stages):
                 await self._reboot()

@@ -258,11 +258,15 @@ def fetched_set(component: Component, result: FetchResult, *, source: str, parti
             system=component.system,
             component=component.component,
         )
-    left_out = [*missing, *map(repr, sorted(component.session.table.left_out))]
-    if left_out:
-        source = f"{source}, without {first_of(left_out, NAMES_SHOWN_MAX)}"
     known = result.params.keys() - set(result.cached)
-    return component_set(component, (each for name, each in result.params.items() if name in known), source)
+    params = (each for name, each in result.params.items() if name in known)
+    return component_set(component, params, lacking(component, source, missing))
+
+
+def lacking(component: Component, source: str, missing: Iterable[str]) -> str:
+    """Return the origin of a set with what it lacks: these parameters, and names that no file can hold."""
+    names = [*missing, *map(repr, sorted(component.session.table.left_out))]
+    return f"{source}, without {first_of(names, NAMES_SHOWN_MAX)}" if names else source
 
 
 def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> ParamSet:
@@ -274,7 +278,9 @@ def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> Par
     source = f"cache {table.key}"
     if not table.complete:
         of = "" if table.count is None else f" of {table.count}"
-        are = f"{table.size}{of} parameters are in the cache"
+        others = sum(param.index is None for param in table.params.values()) if of else 0
+        are = f"{table.size - others}{of} parameters are in the cache"
+        are += f", and {others} that were read by name" if others else ""
         source = f"{source}: {are}"
         if not partial:
             message = f"{table.system}/{table.component} is incomplete: {are}"

@@ -202,8 +202,18 @@ def test_the_backup_file_has_the_state_before(command: Command, put: Put, file: 
     outcome = command("apply", put(vehicle), file("RTL_ALT,99\n"), "--backup", backup)
     assert (outcome.code, "exists already" in outcome.err) == (2, True)
     assert (kept.read_bytes(), vehicle.values["RTL_ALT"]) == (before, 2500)
+    outcome = command("apply", put(vehicle), file("RTL_ALT,99\n"), "--backup", tmp_path / "none" / "x.json")
+    assert (outcome.code, "writing to" in outcome.err, vehicle.values["RTL_ALT"]) == (2, False, 2500)
     assert command("restore", put(vehicle), kept).code == 0
     assert vehicle.values == copter().values
+
+
+def test_the_backup_of_an_incomplete_table_names_what_it_lacks(
+    command: Command, put: Put, file: File, tmp_path: Path
+) -> None:
+    vehicle, backup = Partial({"A": (1, ParamType.INT32)}, count=lambda index: 2), tmp_path / "b.param"
+    assert command("apply", put(vehicle), file("A,2\n"), "--backup", backup).code == 0
+    assert "# from vehicle 1/1, without index 1\nA,1\n" in backup.read_text()
 
 
 # restore

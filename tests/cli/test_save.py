@@ -80,6 +80,15 @@ def test_what_was_received_is_written_with_incomplete_and_the_file_names_the_oth
         path.unlink()
 
 
+def test_cached_parameters_outside_of_the_list_are_counted_apart(
+    command: Command, put: Put, tmp_path: Path
+) -> None:
+    vehicle = PX4Vehicle(table=dict.fromkeys("ABCD", 1), not_in_use=["C", "D"])
+    assert command("get", put(vehicle), "A", "C", "D").code == 0
+    refused = command("save", "1", tmp_path / "quad.json")
+    assert "incomplete: 1 of 2 parameters are in the cache, and 2 that were read by name" in refused.err
+
+
 @pytest.mark.parametrize("ending", ["params", "param", "json"])
 def test_what_a_format_cannot_hold_is_left_out_and_named(
     command: Command, put: Put, tmp_path: Path, ending: str
