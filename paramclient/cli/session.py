@@ -349,8 +349,14 @@ async def _with_parameters(components: Sequence[Component]) -> list[Component]:
     """Return the components that have a parameter, and print a line for each other."""
 
     async def ask(component: Component) -> None:
-        with suppress(NoReply, UnknownParameter):
-            await component.get(0, timeout=OTHERS_TIMEOUT)
+        async def read(index: int) -> None:
+            with suppress(NoReply, UnknownParameter):
+                await component.get(index, timeout=OTHERS_TIMEOUT)
+                tasks.cancel_scope.cancel()
+
+        async with anyio.create_task_group() as tasks:
+            for first in (0, 1):  # some begin at 1
+                tasks.start_soon(read, first)
         if component.count is None:
             noun, hint = "parameters", "; --extended uses extended ones"
             if component.is_extended:

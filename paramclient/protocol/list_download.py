@@ -24,7 +24,8 @@ from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 LIST_REQUESTS_MAX: Final = 12
 """Requests for a list that does not begin: an ArduPilot ignores them early after its start."""
 LIST_REQUESTS_ALONE: Final = 3
-"""The first of them; reads of the index 0 and 1 take turns with the others, for firmware without a list."""
+"""The first of them; reads of the index 0 and 1 take turns with the others, for firmware without a list. With
+firmware that was seen to answer these reads only, the first one is alone."""
 LIST_TIMEOUT_MIN: Final = 0.2
 """Seconds to wait for the first value of a list, at least: a second request makes the list begin again."""
 PAUSE_PX4: Final = 0.12
@@ -53,7 +54,7 @@ FRUITLESS_PASSES_MAX: Final = 5
 QUEUE_TIME: Final = 1.0
 """Seconds without a missing value after which no answer to a read waits behind others in the queue of a slow
 radio: PX4 fills that with its list within a second, at 57600 baud for 6 s, and answers reads behind it."""
-ATTEMPTS_DOUBTFUL: Final = 5
+ATTEMPTS_DOUBTFUL: Final = 3
 """Attempts to read the index 0 or one behind the last, where no list is served: others are answered."""
 GAPS_INTERVAL: Final = 0.02
 """Seconds after which gaps are looked at again without a new value."""
@@ -129,11 +130,12 @@ class _Download:
         """Request the list until its first value arrives; later a value too, where no list is served."""
         channel, dialect, target = self.channel, self.session.dialect, self.channel.reads_from
         self._began = anyio.current_time()
+        alone = 1 if self.session.reads_by_index else LIST_REQUESTS_ALONE
 
         def request(attempt: int) -> Message:
             self.session.report(0, self.table.count)
             self._begins_at = anyio.current_time() if attempt else -math.inf
-            if attempt < LIST_REQUESTS_ALONE or attempt % 2 == 0:
+            if attempt < alone or attempt % 2 == 0:
                 return dialect.request_list(target)
             which = attempt // 2 % 2 ^ 1
             self._reading.add(which)
@@ -190,11 +192,8 @@ class _Download:
             seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
             is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
             has_begun = len(self._received) > self.channel.window_size  # others may answer earlier reads
-            if (
-                (has_begun and not is_slower)
-                or len(missing) < self.channel.window_size
-                or fruitless >= FRUITLESS_PASSES_MAX
-            ):
+            is_few = len(missing) < self.channel.window_size
+            if (has_begun and not is_slower) or is_few or fruitless >= FRUITLESS_PASSES_MAX:
                 return
             self._lost.update(missing)
             await self._next_pass()

@@ -56,11 +56,17 @@ async def read(session: Session, which: str | int) -> ReportedValue:
     spelled = session.spelled(which) if isinstance(which, str) else which
     if spelled != which:
         with suppress(UnknownParameter, NoReply):
-            return await _read(session, spelled)
+            return await _read(session, spelled, which)
+    known = session.table.params.get(which) if isinstance(which, str) and session.reads_by_index else None
+    if known is not None and known.index is not None:
+        answer = await _read(session, known.index)
+        if answer.param_id == which:
+            return answer
     return await _read(session, which)
 
 
-async def _read(session: Session, which: str | int) -> ReportedValue:
+async def _read(session: Session, which: str | int, alias: str | int | None = None) -> ReportedValue:
+    """Read a parameter; of a component without such reads, the list may have it as the alias."""
     channel = session.channel
     began, must_wait = anyio.current_time(), channel.window.value == 0
     async with channel.window:
@@ -69,7 +75,7 @@ async def _read(session: Session, which: str | int) -> ReportedValue:
         is_first = which not in session.reading
         session.reading.add(which)
         try:
-            with channel.inbox((session.dialect.value, which)) as inbox:
+            with channel.inbox(*((session.dialect.value, each) for each in (which, alias))) as inbox:
                 try:
                     return await _ask(session, inbox, which, is_asked=not is_first)
                 except NoReply:
@@ -80,7 +86,7 @@ async def _read(session: Session, which: str | int) -> ReportedValue:
                         if channel.is_lost or (listed := await _read_list(session, inbox, which)) is None:
                             raise
                         return listed
-                if control.param_id == which:
+                if control.param_id in (which, alias):
                     return control
                 with suppress(NoReply):  # it answers by now, and may only have been busy
                     return await _ask(session, inbox, which, channel.timing.attempts_for(CONTROL_LOST))
@@ -206,19 +212,16 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
 
     That is the same parameter by its index, where that is known: some components answer no read by name.
     """
-    answers_names = session.channel.answered.is_set() and session.serves_reads.get(str) is not False
-    px4 = session.identification.is_px4 and answers_names
     live = {name: param.index for name, param in session.table.params.items() if param.trust is Trust.LIVE}
     same = live.pop(which, None) if isinstance(which, str) else None
-    other = next(iter(live), 0) if same is None else same
-    control = await _try(session, HASH_CHECK if px4 else other)
-    if control is None and px4:  # it may only call itself a PX4
-        control = await _try(session, other)
+    control = await _try(session, next(iter(live), 1) if same is None else same)
     is_proven = not isinstance(which, str) or session.serves_reads.get(str)
     if control is None or is_proven or control.param_id == which:
         return control
     await anyio.sleep(session.channel.timing.timeout(0))  # its other answers would be taken for one by name
-    return await _try(session, control.param_id)
+    by_name = await _try(session, control.param_id)
+    session.reads_by_index = by_name is None
+    return by_name
 
 
 async def _try(session: Session, which: str | int) -> ReportedValue | None:
@@ -234,8 +237,7 @@ async def _try(session: Session, which: str | int) -> ReportedValue | None:
         try:
             return await _ask(session, inbox, which, requests)
         except (NoReply, VehicleError):
-            if which != HASH_CHECK:
-                session.serves_reads.setdefault(type(which), False)
+            session.serves_reads.setdefault(type(which), False)
             return None
 
 
@@ -275,10 +277,8 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
         raise failures[0]
     if session.channel.is_lost or has_gap:
         return None
-    names = session.table.names
-    is_short = not session.table.is_complete
-    sent = f": its list has {len(names)} of {session.table.count} parameters"
-    raise _unknown(session, which, sent * is_short)
+    sent = f": its list has {len(session.table.names)} of {session.table.count} parameters"
+    raise _unknown(session, which, sent * (not session.table.is_complete))
 
 
 def _unknown(session: Session, which: str | int, reason: str = "") -> UnknownParameter:

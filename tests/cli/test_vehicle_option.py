@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from paramclient import read_file
+from paramclient import ParamType, read_file
 from paramclient.sim import Air, ArduPilotVehicle, Camera, PX4Vehicle
 from tests.commands import Command, Put, metadata_file, strict
+from tests.conversations.partial import Partial
 from tests.shell import Eventful, Tap
 
 URL = "udpin:0.0.0.0:14550"
@@ -104,10 +105,16 @@ def test_all_reads_other_components_that_have_parameters_and_names_those_without
     command: Command, put: Put
 ) -> None:
     cameras = [Camera(component=100), Camera(component=101, plain={"ZOOM": 2})]
-    url = put(Air([px4(), *cameras]))
+    gimbal = Partial({"PAN": (3, ParamType.INT8)}, serves=("indices",), first=1, component=154)
+    url = put(Air([px4(), *cameras, gimbal]))
     fetched = command("fetch", url, "--vehicle", "all")
     assert fetched.code == 0, fetched.err
-    assert [line[:2] for line in fetched.words[1:]] == [["1/1", "A"], ["1/1", "B"], ["1/101", "ZOOM"]]
+    assert [line[:2] for line in fetched.words[1:]] == [
+        ["1/1", "A"],
+        ["1/1", "B"],
+        ["1/154", "PAN"],
+        ["1/101", "ZOOM"],
+    ]
     assert "1/100 camera has no parameters, or none within 2.5 s" in fetched.err
     assert command("set", url, "ZOOM", 3, "--vehicle", "all").code == 2
     assert not cameras[1].requests["PARAM_SET"]

@@ -155,6 +155,14 @@ async def test_a_list_of_firmware_without_reads_is_requested_until_it_is_complet
         assert (await fetch_all(session)).missing == ()
 
 
+@pytest.mark.parametrize("seed", range(8))
+async def test_reads_by_index_alone_suffice_on_a_lossy_link(seed: int) -> None:
+    vehicle = Partial(serves=("indices", "sets"), first=1, heartbeat=QUIET)
+    async with talking(Air.symmetric([vehicle], delay=0.15, loss=0.1, seed=seed)) as (_, session):
+        with anyio.fail_after(15.0):
+            assert (await write(session, "MODE", 4)).status == "accepted"
+
+
 async def test_the_first_value_of_a_list_that_is_lost_is_missing_and_no_other() -> None:
     vehicle = Tap(Partial(serves=("list",)), down=lambda message: getattr(message, "param_index", None) != 0)
     async with talking(vehicle) as (_, session):
@@ -162,14 +170,15 @@ async def test_the_first_value_of_a_list_that_is_lost_is_missing_and_no_other() 
         assert (result.missing, result.received) == ((0,), len(TABLE) - 1)
 
 
+@pytest.mark.parametrize("delay", [0.05, 0.3])
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("serves", [EVERYTHING, ("names", "sets"), ("indices", "sets")])
 async def test_names_in_lower_case_are_found_whatever_the_autopilot(
-    serves: tuple[str, ...], first: int
+    serves: tuple[str, ...], first: int, delay: float
 ) -> None:
     table = {"gain": (0.5, ParamType.REAL32), "mode": (5, ParamType.REAL32)}
     vehicle = Partial(table, serves=serves, first=first, heartbeat=ARDUPILOT)
-    async with talking(Air.symmetric([vehicle], delay=0.05)) as (_, session):
+    async with talking(Air.symmetric([vehicle], delay=delay)) as (_, session):
         result = await write(session, "mode", 4)
         assert (result.name, result.actual) == ("mode", 4)
         assert anyio.current_time() < 15.0
