@@ -71,8 +71,8 @@ NO_ANSWER: Final = ParamErrorCode.COMPONENT_NOT_FOUND
 
 Key = TypeVar("Key")
 Which: TypeAlias = "str | int"
-SetKey: TypeAlias = tuple[str, bytes, int]
-"""Name, bytes and type in a set."""
+SetKey: TypeAlias = tuple[str, bytes, int, int]
+"""Name, bytes and type in a set, and the number of the change of mind: a set back is no repetition."""
 
 
 class Asker(NamedTuple):
@@ -262,8 +262,7 @@ class KeptTable(Stream[Change]):
 
     def send_list(self, station: GroundStation) -> None:
         """Answer a request for the list: from the table, or as a fetch brings it."""
-        values = self.list_if_current
-        if values is not None:
+        if values := self.list_if_current:
             self.check()
             self._stream(station, values, set())
         else:
@@ -350,8 +349,7 @@ class KeptTable(Stream[Change]):
 
     def read(self, asker: Asker, which: Which) -> None:
         """Answer a read; the vehicle is asked for what the table does not have."""
-        value = self.known(which)
-        if value is not None:
+        if value := self.known(which):
             self.check()
             asker.station.say(value, self.source)
         elif self._is_unknown(which):
@@ -396,16 +394,17 @@ class KeptTable(Stream[Change]):
         with anyio.move_on_after(READ_TIMEOUT if isinstance(which, int) else by_name):
             while self.is_loading and not self.known(which):  # noqa: ASYNC110 - no event for one value
                 await anyio.sleep(PROGRESS_INTERVAL)
-        known = self.known(which)
-        if known is not None:
+        if known := self.known(which):
             return known
         async with turns, self._asking:
             value = await read(self.session, which)
         return value._replace(param_id=which) if isinstance(which, str) else value
 
     def set(self, asker: Asker, message: messages.ParamSet | messages.ParamExtSet) -> None:
-        """Carry out a set as a verified write; equal ones at the same time are one."""
-        key = (message.param_id, message.raw, message.param_type)
+        """Carry out a set as a verified write; one that repeats the newest of its parameter joins it."""
+        wanted = (message.param_id, message.raw, message.param_type)
+        newest = next((each for each in reversed(self._sets) if each[0] == message.param_id), (*wanted, 0))
+        key = newest if newest[:3] == wanted else (*wanted, newest[3] + 1)
         if asker.station.endpoint.is_readonly:
             self._reject([asker], key, ParamErrorCode.READ_ONLY)
         elif not asker.may_write:
@@ -418,7 +417,7 @@ class KeptTable(Stream[Change]):
         try:
             with anyio.move_on_after(SET_TIMEOUT):
                 async with first.station.writing:
-                    code = await self._write(*key, f"station {first.system}/{first.component}")
+                    code = await self._write(key, f"station {first.system}/{first.component}")
         except ParamClientError as error:
             code = _code_of(error)
         finally:
@@ -426,7 +425,7 @@ class KeptTable(Stream[Change]):
         if code:
             self._reject(askers, key, code)
 
-    async def _write(self, name: str, raw: bytes, number: int, author: str) -> ParamErrorCode:
+    async def _write(self, key: SetKey, author: str) -> ParamErrorCode:
         """Write a value, and acknowledge it to the askers.
 
         A component that takes values byte by byte takes those of its own type only.
@@ -435,9 +434,10 @@ class KeptTable(Stream[Change]):
             ParamClientError: as from `Component.set`.
         """
         session, is_extended = self.session, self.session.dialect.has_ack
+        name, raw, number, _ = key
         while not is_decoded(session):  # noqa: ASYNC110 - no event for doubt
             await anyio.sleep(PROGRESS_INTERVAL)
-        askers, params = self._sets[name, raw, number], session.table.params
+        askers, params = self._sets[key], session.table.params
         if name not in params or params[name].trust is Trust.CACHED:
             await read(session, name)
         known = params[name].type
@@ -458,7 +458,7 @@ class KeptTable(Stream[Change]):
 
     def _reject(self, askers: Iterable[Asker], key: SetKey, code: int) -> None:
         """Refuse a set, and show the value that stays."""
-        name, raw, number = key
+        name, raw, number, _ = key
         if self.session.dialect.has_ack:
             is_value = code in (ExtAckResult.VALUE_UNSUPPORTED, ParamErrorCode.TYPE_MISMATCH)
             result = ExtAckResult.VALUE_UNSUPPORTED if is_value else ExtAckResult.FAILED

@@ -276,7 +276,7 @@ async def health(request: Request, hub: HubArgument) -> dict[str, Any]:
 
 @reading.get("/api/events", response_class=EventSourceResponse)
 async def events(
-    hub: HubArgument, last_event_id: Annotated[str | None, Header()] = None
+    hub: HubArgument, last_event_id: Annotated[str | None, Header(max_length=100)] = None
 ) -> AsyncIterator[ServerSentEvent]:
     """Stream all events (server-sent events); with Last-Event-ID, those that were missed first."""
     async for event in hub.feed.follow(last_event_id):

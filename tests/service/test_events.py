@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 
 from paramclient.sim import ArduPilotVehicle
-from tests.service.hub import V, browsing, service, synced
+from tests.service.hub import V, browsing, problem, service, synced
 from tests.shell import Tap, generic
 
 
@@ -91,6 +91,8 @@ async def test_a_stream_resumes_after_the_last_event() -> None:
         for foreign in ("0123456789abcdef-1", "nonsense", last.partition("-")[0] + "-999999", f"{last}x"):
             async with events(browser, foreign) as stream:
                 assert stream.resumed is False
+        answer = await browser.get("/api/events", headers={"Last-Event-ID": f"{last}{'9' * 5_000}"})
+        problem(answer, 422, "invalid-request")
 
 
 async def test_a_table_has_the_number_of_the_last_event_that_it_includes() -> None:

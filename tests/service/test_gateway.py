@@ -575,6 +575,14 @@ async def test_rule_4_different_sets_queue() -> None:
         assert by_name(first)["PARAM_01"] == by_name(second)["PARAM_01"] == struct.pack("<i", 33)
 
 
+async def test_rule_4_a_set_back_is_no_repetition() -> None:
+    async with in_sync(Air.symmetric([small_px4()], delay=0.05)) as (_, vehicle, station):
+        back = [set_to("PARAM_01", value) for value in (9, 9, 33, 9, 9)]
+        await station.ask(*back, seconds=3.0)
+        assert vehicle.messages(ParamSet) == back[1:4]
+        assert by_name(station)["PARAM_01"] == struct.pack("<i", 9)
+
+
 async def test_rule_4_an_error_goes_to_the_asker_alone_within_3_seconds() -> None:
     async with in_sync(small_px4()) as (served, vehicle, station):
         other = served.partner(system=9)
