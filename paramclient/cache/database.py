@@ -276,11 +276,10 @@ class SqliteStore(Store):
         if durable:
             connection.execute("PRAGMA synchronous = FULL")
         connection.execute("BEGIN IMMEDIATE" if writing else "BEGIN")
-        is_empty = not _has_tables(connection)
-        if is_empty and not writing:
-            connection.execute("COMMIT")
-            return _read_nothing(work)
-        if is_empty:
+        if not _has_tables(connection):
+            if not writing:
+                connection.execute("COMMIT")
+                return _read_nothing(work)
             _create(connection)
         result = work(Transaction(connection))
         if durable:  # a transaction without a write would not sync; this writes the unchanged version

@@ -25,8 +25,8 @@ from paramclient.cache.records import (
 HISTORY_ENTRIES_MAX: Final = 10_000
 """Maximum number of history lines of each table, the newest: about 1 MB, and years of tuning by hand."""
 SAME_CHANGE_MAX: Final = 2.0
-"""Maximum seconds between the times of one change in the cache and in a log: the cache may have received it
-later, or from another link."""
+"""Maximum seconds between the times of one change in the cache and in a log, or of two programs: one may have
+received it later, or from another link."""
 
 _OLD: Final = "old_type, old_value"
 _LINE: Final = f"at, name, author, old_at, {_OLD}, new_type, new_value"

@@ -81,6 +81,7 @@ class StoredParam(NamedTuple):
         heard_at: time of the observation. The later of two observations of a parameter counts.
         default: the firmware's default in the form of the value, or None.
         by: author, if the value is a change: `BY_US`, `us for NAME`, `BY_VEHICLE` or `station 254/190`.
+        before: the value that the program held before a change; None if it held none, or is not known.
     """
 
     name: str
@@ -90,10 +91,16 @@ class StoredParam(NamedTuple):
     heard_at: float
     default: bytes | None = None
     by: str = BY_VEHICLE
+    before: StoredValue | None = None
 
     @classmethod
     def of(
-        cls, param: Param | WrittenParam, heard_at: float, volatile: bool | None = None, by: str = BY_VEHICLE
+        cls,
+        param: Param | WrittenParam,
+        heard_at: float,
+        volatile: bool | None = None,
+        by: str = BY_VEHICLE,
+        before: Param | None = None,
     ) -> StoredParam:
         """Return an observation of a parameter, whose type is known; its trust is not stored.
 
@@ -110,6 +117,7 @@ class StoredParam(NamedTuple):
             heard_at,
             None if default is None else StoredValue.of(number, bits_of(default, number)).value,
             by,
+            None if before is None else StoredValue.of(before.type, before.bits, is_raw=before.is_raw),
         )
 
     @classmethod

@@ -16,7 +16,7 @@ from operator import attrgetter
 from typing import Any, Final
 
 from paramclient.cache.database import IDENTITY, Transaction
-from paramclient.cache.history import Line, add_lines, load_lines, merged_lines
+from paramclient.cache.history import SAME_CHANGE_MAX, Line, add_lines, load_lines, merged_lines
 from paramclient.cache.records import (
     CachedComponent,
     CachedSummary,
@@ -224,7 +224,9 @@ def save_table(tx: Transaction, update: TableUpdate, now: float) -> None:
     is_rehashed = False
     lines: list[Line] = []
     for batch in _rounds(observed):
-        items = [_completed(item, rows.get(item.name), is_whole=update.replace) for item in batch]
+        new = [item for item in batch if not _is_recorded(tx, owner, item, rows.get(item.name))]
+        agrees = agrees and len(new) == len(batch)
+        items = [_completed(item, rows.get(item.name), is_whole=update.replace) for item in new]
         for item, has_won in zip(items, _write_rows(tx, owner, items, horizon), strict=True):
             old = rows.get(item.name)
             is_same = is_same_value(old and old.stored, item.stored)
@@ -314,6 +316,17 @@ def _rounds(items: Iterable[StoredParam]) -> list[list[StoredParam]]:
         rounds[count[item.name]].append(item)
         count[item.name] += 1
     return rounds
+
+
+def _is_recorded(tx: Transaction, owner: int, item: StoredParam, row: StoredParam | None) -> bool:
+    """Return whether another program has stored this change, and a later one: on a busy computer, a program
+    reads messages some time after another one."""
+    stored, old, new = row and row.stored, item.before, item.stored
+    if not (stored and old and new) or stored.is_same(old) or stored.is_same(new):
+        return False
+    which = "owner = ? AND name = ? AND at > ? AND old_value = ? AND new_value = ?"
+    values = owner, item.name, item.heard_at - SAME_CHANGE_MAX, old.value, new.value
+    return bool(tx.all(f"SELECT id FROM history WHERE {which}", values))
 
 
 def _completed(item: StoredParam, old: StoredParam | None, *, is_whole: bool) -> StoredParam:
