@@ -133,11 +133,6 @@ def _format_of(path: Path) -> LogFormat | None:
     return next((each for magic, each in LOG_MAGICS.items() if begin.startswith(magic)), None)
 
 
-def _link(path: str) -> str:
-    """Return the link name of a log, which is part of the identity of a vehicle without a hardware id."""
-    return f"log:{printable_path(path)}"
-
-
 def printable_path(path: str | os.PathLike[str]) -> str:
     """Return the absolute path of a file as text that a cache can store: its name may not be UTF-8."""
     return os.fsencode(os.path.realpath(path)).decode(errors="backslashreplace")
@@ -195,7 +190,7 @@ def _read_dataflash(path: str) -> OnboardLog:
         LogFormat.DATAFLASH,
         Identity(
             next((each for each in ids if isinstance(each, int) and 0 < each < 256), 0),
-            _link(path),
+            f"log:{printable_path(path)}",
             autopilot=MAV_AUTOPILOT_ARDUPILOTMEGA,
             **_described(found["MSG"], found["VER"]),
         ),
@@ -340,7 +335,7 @@ def _identity(info: Mapping[str, Any], params: Mapping[str, WrittenParam], path:
     guid = _text(info, "sys_uuid").lower()
     return Identity(
         system=system if 0 < system < 256 else 0,
-        link=_link(path),
+        link=f"log:{printable_path(path)}",
         uid=guid if _GUID.fullmatch(guid) else None,
         autopilot=MAV_AUTOPILOT_PX4,
         vehicle_type=kind,
