@@ -18,7 +18,7 @@ from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link
 from paramclient.links.sockets import TcpIn
 from paramclient.protocol.addresses import peer_in_words
-from paramclient.wire.frames import renumber_frame, sign_frame
+from paramclient.wire.frames import renumber_frame, sign_frame, unsign_frame
 from paramclient.wire.messages import Message, encode, message_id
 from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
 
@@ -247,9 +247,9 @@ class GroundStation:
             else:
                 self.relayed += 1
                 is_version_2 = item[0] == 0xFD
-                if is_version_2 and item[2]:  # signed: renumbered, it would be rejected
-                    return item
-                return renumber_frame(item, numbering.relay(item[4 if is_version_2 else 2]))
+                if is_version_2 and item[2] and not self.endpoint.is_trusted:
+                    return item  # signed: renumbered, it would be rejected
+                return renumber_frame(unsign_frame(item), numbering.relay(item[4 if is_version_2 else 2]))
         return None
 
     def _next_of_streams(self) -> bytes | None:
@@ -283,11 +283,12 @@ class MavlinkEndpoint:
     Args:
         link: its name, or a link.
         is_readonly: whether nothing of its stations changes a vehicle.
-        is_trusted: whether its stations, which need not sign, may write to a signed vehicle.
+        is_trusted: whether its stations, which do not sign, may write to a signed vehicle. They receive its
+            frames without signatures.
         key: with which its stations and the answers are signed; None for unsigned stations.
 
     Attributes:
-        link, name, is_readonly, is_trusted: as given.
+        link, name, is_readonly, is_trusted: as given; with a key, all its stations sign.
         signer: signs the answers; None without a key.
         stations: the connected stations.
         sending: called with each frame and each datagram that is about to be sent to a station.
@@ -304,7 +305,7 @@ class MavlinkEndpoint:
         self.link = create_link(link)
         self.name = self.link.name
         self.is_readonly = is_readonly
-        self.is_trusted = is_trusted
+        self.is_trusted = is_trusted and key is None
         self.stations: dict[Peer | None, GroundStation] = {}
         self.sending: Callable[[bytes], None] = lambda data: None
         self.signer: Signer | None = None

@@ -725,6 +725,10 @@ async def test_rule_8_an_unsigned_set_is_signed_for_a_trusted_endpoint_alone(is_
     async with in_sync(model, endpoint={"is_trusted": is_trusted}, signing=KEY) as (_, _, station):
         await station.ask(set_to("PARAM_01", 5), seconds=3.0)
         assert model.values["PARAM_01"] == (5 if is_trusted else 1)
+        await station.ask(LIST, seconds=3.0)
+        are_signed = {bool(data[2]) for data in station.datagrams}
+        found = (len(station.of(ParamValue)), station.lost[1, 1], are_signed)
+        assert found == (26 * is_trusted, 0, {not is_trusted})
 
 
 # 9: no ground station
