@@ -237,8 +237,7 @@ class Target:
             self.check()
         store, identity = self.hub.metadata_store, self.component.identity
         if store is not None and self.described != identity and not self.component.is_extended:
-            number = self.component.component
-            self.metadata = await anyio.to_thread.run_sync(store.known, identity, number)
+            self.metadata = await anyio.to_thread.run_sync(store.known, identity, self.component.component)
             self.described = identity
         return result
 

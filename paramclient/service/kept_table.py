@@ -184,6 +184,7 @@ class KeptTable(Stream[Change]):
     Attributes:
         component, session, source: of the component.
         changes: the number of changes so far.
+        heartbeat: the last one, with plain parameters.
     """
 
     most = 0  # changes are taken at once, and none is queued
@@ -194,6 +195,7 @@ class KeptTable(Stream[Change]):
         self.session = component.session
         self.source = (component.system, component.component)
         self.changes = 0
+        self.heartbeat: Message | None = None
         self._announce = announce
         self._list_at = lru_cache(1)(lambda state: whole_list(component.session))
         self._unserved_until = -math.inf
@@ -284,6 +286,9 @@ class KeptTable(Stream[Change]):
     ) -> Iterator[Message]:
         """Yield the values of one list, each as it is by then, until the component is lost or restarts.
 
+        A heartbeat precedes the first one: a station may ask before it has heard one, and MAVProxy does not
+        decode a PX4's integers then, although it would hear one while the vehicle itself answers.
+
         Args:
             values: of the list, as they were after so many changes.
             sent: takes the index of each yielded value.
@@ -292,6 +297,8 @@ class KeptTable(Stream[Change]):
         for value in values:
             if self.is_lost or self.component.node.generation != generation:
                 return
+            if not sent and self.heartbeat is not None:
+                yield self.heartbeat
             param = self.session.table.params.get(value.param_id)
             if self.changes != changes and param is not None:
                 now = value_of(self.session, param, index=value.param_index)

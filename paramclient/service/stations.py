@@ -19,7 +19,7 @@ from paramclient.links import Link, Peer, create_link
 from paramclient.links.sockets import TcpIn
 from paramclient.protocol.addresses import peer_in_words
 from paramclient.wire.frames import renumber_frame, sign_frame, unsign_frame
-from paramclient.wire.messages import Message, encode, message_id
+from paramclient.wire.messages import Heartbeat, Message, encode, message_id
 from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
 
 FRAMES_PER_DATAGRAM: Final = 37
@@ -255,7 +255,7 @@ class GroundStation:
     def _next_of_streams(self) -> bytes | None:
         for key, (source, messages) in list(self._streams.items()):
             for message in messages:
-                return self._inserted(source, message, is_answer=True)
+                return self._inserted(source, message, not isinstance(message, Heartbeat))
             del self._streams[key]
         return None
 

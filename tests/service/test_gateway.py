@@ -207,6 +207,15 @@ async def test_rule_2_px4_answers_its_hash_and_goes_on_with_its_list() -> None:
         assert not requested(vehicle)
 
 
+async def test_rule_2_a_station_that_has_heard_no_heartbeat_hears_one_before_the_list() -> None:
+    """MAVProxy asks whatever it has heard, and decodes a PX4's integers by its heartbeat."""
+    async with in_sync(small_px4()) as (_, _, station):
+        await station.ask(LIST, seconds=0.1)
+        first, *others = (each for each in station.frames if each.system == 1)
+        assert isinstance(beat := messages.decode(first), Heartbeat)
+        assert (beat.autopilot, len(station.of(ParamValue)), others[0].message_id) == (12, 26, 22)
+
+
 async def test_rule_2_an_unknown_name_is_asked_of_the_vehicle_once() -> None:
     async with in_sync(small_px4()) as (served, vehicle, station):
         other = served.partner(system=9)
@@ -900,7 +909,7 @@ async def test_rule_14_stations_are_shown_with_what_they_save() -> None:
     async with browsing(small_px4(), mavlink=[MavlinkEndpoint(link)]) as browser:
         station, quiet = Partner(link), Partner(link, system=9)
         await station.ask(LIST)
-        saved = sum(map(len, station.datagrams))
+        saved = sum(map(len, station.datagrams)) - 21  # but for the heartbeat before the list
         await quiet.ask(GCS)
         await browser.put(f"{V}/params/PARAM_01", json={"value": 9})
         shown, other = (await browser.get("/api/stations")).json()
