@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Hashable, Iterable, Iterator, Sequence
+from contextlib import AsyncExitStack
 from dataclasses import replace
 from functools import cache, partial
 from typing import Final, TypeAlias
@@ -16,7 +17,6 @@ import anyio
 
 from paramclient.client.client import ParamClient
 from paramclient.client.taps import SeenFrame, Tap
-from paramclient.errors import LinkError
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.protocol.node import Node
 from paramclient.protocol.session import Session
@@ -100,13 +100,11 @@ class Gateway:
         Raises:
             LinkError: one cannot be opened, and none is open then.
         """
-        try:
+        async with AsyncExitStack() as opened:
             for endpoint in self.endpoints:
+                opened.push_async_callback(endpoint.link.close)
                 await endpoint.open()
-        except LinkError:
-            for endpoint in self.endpoints:
-                await endpoint.link.close()
-            raise
+            opened.pop_all()
 
     async def run(self) -> None:
         """Serve the stations at the open endpoints, until cancelled."""

@@ -15,7 +15,6 @@ import re
 import secrets
 import socket
 from collections.abc import Callable, Generator, Mapping
-from importlib import resources
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
@@ -261,8 +260,7 @@ def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
     app.add_middleware(guard, tokens=tokens)
     for router in routes.ROUTERS:
         app.include_router(router)
-    page = resources.files("paramclient.service").joinpath("page")
-    app.mount("/", StaticFiles(directory=str(page), html=True))
+    app.mount("/", StaticFiles(packages=[("paramclient.service", "page")], html=True))
     return app
 
 
