@@ -8,7 +8,7 @@ from pathlib import PurePath
 from typing import Final
 
 from paramclient.errors import FileError
-from paramclient.model.notation import NamedChoice
+from paramclient.model.names import NamedChoice
 from paramclient.model.paramset import ParamSet
 
 AUTOPILOT: Final = 1

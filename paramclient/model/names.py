@@ -1,12 +1,14 @@
-"""Names of parameters: selection, similar names, switches of groups; counts and lists of them in messages."""
+"""Names of parameters: selection, similar names, switches of groups; counts and lists in messages; choices by
+name."""
 
 from __future__ import annotations
 
 import difflib
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from enum import StrEnum
 from fnmatch import translate
-from typing import Final, TypeVar
+from typing import Final, NoReturn, TypeVar
 
 from paramclient.errors import UsageError
 
@@ -197,3 +199,12 @@ def first_of(words: Sequence[object], limit: int) -> str:
     """
     more = len(words) - limit
     return ", ".join(map(str, words[:limit])) + (f" and {more} more" if more > 0 else "")
+
+
+class NamedChoice(StrEnum):
+    """Options that a user names; UsageError for another name."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> NoReturn:
+        what = re.sub(r"\B(?=[A-Z])", " ", cls.__name__).lower()
+        raise UsageError(f"unknown {what} {value!r}; choose one of {', '.join(cls)}")

@@ -1,12 +1,10 @@
-"""JSON notation of values, bits, hashes and times; choices by name."""
+"""JSON notation of values, bits, hashes and times."""
 
 from __future__ import annotations
 
 import math
-import re
 from datetime import UTC, datetime
-from enum import StrEnum
-from typing import NoReturn, TypeAlias
+from typing import TypeAlias
 
 from paramclient.errors import UsageError
 from paramclient.model.paramset import WrittenParam
@@ -14,15 +12,6 @@ from paramclient.model.values import Param, ParamType, Value, format_value, shor
 
 Scalar: TypeAlias = int | float | str
 """A value in strict JSON."""
-
-
-class NamedChoice(StrEnum):
-    """Options that a user names; UsageError for another name."""
-
-    @classmethod
-    def _missing_(cls, value: object) -> NoReturn:
-        what = re.sub(r"\B(?=[A-Z])", " ", cls.__name__).lower()
-        raise UsageError(f"unknown {what} {value!r}; choose one of {', '.join(cls)}")
 
 
 def value_json(value: Value, number: ParamType | int) -> Scalar:

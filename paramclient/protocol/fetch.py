@@ -10,8 +10,7 @@ from typing import Final, Literal, TypeAlias
 import anyio
 
 from paramclient.errors import NoReply
-from paramclient.model.names import first_of
-from paramclient.model.notation import NamedChoice
+from paramclient.model.names import NamedChoice, first_of
 from paramclient.model.paramset import ParamMap
 from paramclient.model.values import Param
 from paramclient.protocol.checksum import is_moving

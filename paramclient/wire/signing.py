@@ -18,7 +18,7 @@ from types import MappingProxyType
 from typing import Final, NoReturn
 
 from paramclient.errors import UsageError
-from paramclient.model.notation import NamedChoice
+from paramclient.model.names import NamedChoice
 
 KEY_LENGTH: Final = 32
 """Bytes of a signing key."""
