@@ -37,6 +37,8 @@ SHOWN_MAX: Final = 5
 UNCONFIRMED: Final = "The cached table was not confirmed: {}."
 LOST: Final = "The component was lost."
 REPLACED: Final = "Another vehicle has taken the address, and its parameters were fetched: {}."
+RATE_TIME_MIN: Final = 0.1
+"""Seconds of a fetch from which its rate is given: a burst of packets arrives at once."""
 
 
 class Policy(NamedChoice):
@@ -58,7 +60,7 @@ class Progress:
     Attributes:
         received: parameters received.
         total: parameters of the component, or None while unknown.
-        rate: parameters per second since the fetch began.
+        rate: parameters per second since the fetch began; 0 in the first 0.1 s.
         seconds_left: at that rate, or None while unknown.
     """
 
@@ -70,7 +72,7 @@ class Progress:
     @classmethod
     def after(cls, received: int, total: int | None, elapsed: float) -> Progress:
         """Return the progress `elapsed` seconds after the begin."""
-        rate = received / elapsed if elapsed > 0 else 0.0
+        rate = received / elapsed if elapsed >= RATE_TIME_MIN else 0.0
         left = (total - received) / rate if rate and total is not None else None
         return cls(received, total, rate, left)
 
