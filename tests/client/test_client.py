@@ -165,6 +165,15 @@ async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
             await component.set("_HASH_CHECK", 0)
 
 
+async def test_a_px4_has_fewer_parameters_from_its_second_start_on() -> None:
+    async with fetched(PX4Vehicle()) as (_, component):
+        before = set(component.params)
+        component = await component.reboot()
+        result = await component.fetch_all()
+        assert before - set(result.params) == {"CAL_BARO1_ID", "CAL_BARO2_ID", "CAL_BARO3_ID"}
+        assert (result.complete, result.count) == (True, len(before) - 3)
+
+
 async def test_invalid_values_and_names_are_not_sent() -> None:
     table: dict[str, Any] = {"SMALL": (ParamType.UINT8, 1), "WHOLE": 1}
     tap = Tap(GenericVehicle(table))
