@@ -37,7 +37,7 @@ SHOWN_MAX: Final = 5
 UNCONFIRMED: Final = "The cached table was not confirmed: {}."
 LOST: Final = "The component was lost."
 REPLACED: Final = "Another vehicle has taken the address, and its parameters were fetched: {}."
-RATE_TIME_MIN: Final = 0.1
+PROGRESS_RATE_TIME_MIN: Final = 0.1
 """Seconds of a fetch from which its rate is given: a burst of packets arrives at once."""
 
 
@@ -72,7 +72,7 @@ class Progress:
     @classmethod
     def after(cls, received: int, total: int | None, elapsed: float) -> Progress:
         """Return the progress `elapsed` seconds after the begin."""
-        rate = received / elapsed if elapsed >= RATE_TIME_MIN else 0.0
+        rate = received / elapsed if elapsed >= PROGRESS_RATE_TIME_MIN else 0.0
         left = (total - received) / rate if rate and total is not None else None
         return cls(received, total, rate, left)
 
