@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import logging
+import re
 import signal
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,6 +22,8 @@ from paramclient.version import __version__
 
 _HELPED: Final = frozenset({"--help", "-h", "cache", "metadata", "signing"})
 """Words with which help is printed that describes each subcommand; groups print it where none follows."""
+_LINE_BREAK: Final = re.compile(r"(?<=\S)\n( {8})?(?=\S)")
+"""A line break within a paragraph of a docstring, of which help would make one on every terminal."""
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -32,13 +35,15 @@ def run(arguments: Sequence[str]) -> int:
         BrokenPipeError: the reader of stdout has closed it.
     """
     if not arguments or not _HELPED.isdisjoint(arguments):
-        dict(subcommands())  # imports all of them, so that the help can describe each
+        for _, app in subcommands():  # imports all of them, so that the help can describe each
+            app.default_command.__doc__ = _LINE_BREAK.sub(" ", inspect.getdoc(app.default_command) or "")
     with _messages_shown(verbose=not {"--verbose", "-v"}.isdisjoint(arguments)):
         try:
             words = [STDIN if word == "-" else word for word in arguments]
             command, bound, _ = _app.parse_args(words, exit_on_error=False, print_error=False)
             words = ["-" if word == STDIN else word for word in bound.args]
-            call = partial(command, *words, **bound.kwargs)
+            named = {name: "-" if value == STDIN else value for name, value in bound.kwargs.items()}
+            call = partial(command, *words, **named)
             code = anyio.run(_until_signal, call) if inspect.iscoroutinefunction(command) else call()
         except CycloptsError as error:
             usage = None
@@ -142,10 +147,10 @@ _app: Final = App(
     help_format="plaintext",
     version_format="plaintext",
 )
-_cache: Final = App(name="cache", help="List or remove tables in the cache. Needs no link.")
-_signing: Final = App(name="signing", help="Set and remove the signing key of a vehicle.")
+_cache: Final = App(name="cache", help="List or remove tables in the cache. Needs no link.", help_epilogue="")
+_signing: Final = App(name="signing", help="Set and remove the signing key of a vehicle.", help_epilogue="")
 _metadata: Final = App(
-    name="metadata", help="Add, list or remove metadata files, which describe parameters. Needs no link."
+    name="metadata", help="Add, list or remove files that describe parameters.", help_epilogue=""
 )
 
 
@@ -167,7 +172,7 @@ def _add(group: App, function: str, arguments: str | None = None, *examples: str
         f"paramclient.cli.{function}",
         name=name,
         usage=None if arguments is None else f"Usage: paramclient {words} [OPTIONS] {arguments}",
-        help_epilogue=_examples(*(f"{words} {each}".rstrip() for each in examples)) if examples else None,
+        help_epilogue=_examples(*(f"{words} {each}".rstrip() for each in examples)) if examples else "",
     )
 
 
@@ -184,17 +189,15 @@ _add(_app, "cached:history", "VEHICLE [NAME...]", "1 'MC_*' --since '2h ago'", "
 _add(_app, "show:search", "WORD [WORD...]", "roll rate", "geofence --metadata apm.pdef.xml")
 _add(_app, "show:info", None, "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
 _add(_app, "sources:save", "URL|LOG|VEHICLE FILE", "udpin:0.0.0.0:14550 quad.params", "1 own.param --changed")
-_add(
-    _app, "apply:apply", "URL FILE", "sim:px4 quad.params --dry-run", "sim:px4 '{system}.param' --vehicle all"
-)
+_add(_app, "apply:apply", "URL FILE", "sim:px4 quad.params --dry-run", "sim:px4 {system}.param --vehicle all")
 _add(_app, "apply:restore", "URL [WHEN|FILE]", "sim:px4 --dry-run", "udpin:0.0.0.0:14550 '2h ago'")
 _add(_app, "cached:import_", "FILE [FILE...]", "flight.tlog")
 _add(_app, "serve:serve", "LINK [LINK...]", "serial:/dev/ttyACM0:57600 --listen 127.0.0.1:0")
 _add(_app, "serve:token", None, "anna --file tokens", "wall-display --file tokens --read")
 _add(_app, "link:ports")
 _add(_app, "serve:sim", None, "px4 --link udpout:127.0.0.1:14550", "'ardupilot?loss=0.05&seed=1'")
-for _group in (_cache, _metadata, _signing):
-    _app.command(_group)
+for _each in (_cache, _metadata, _signing):
+    _app.command(_each)
 _add(_signing, "signing:setup", None, "udpin:0.0.0.0:14550 --signing-key vehicle.key")
 _add(_signing, "signing:disable", None, "udpin:0.0.0.0:14550 --signing-key vehicle.key")
 _add(_metadata, "metadata:metadata_add", None, "apm.pdef.xml --firmware 4.6")

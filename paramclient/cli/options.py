@@ -17,9 +17,6 @@ from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.model.values import Encoding
 from paramclient.wire.signing import SigningKey
 
-SOURCE_SYSTEM: Final = 255
-"""The usual system id of ground stations, and the default of `ParamClient`."""
-
 CONNECTION: Final = Parameter(group=Group("Connection", sort_key=9))
 """Options of the link, which stand at the end of the help."""
 
@@ -61,7 +58,7 @@ class KeyOptions:
     signing_key: Annotated[Path | None, CONNECTION] = None
     """A file with the key. Default: that of the environment."""
 
-    source_system: Annotated[int, CONNECTION, Parameter(validator=Number(gte=1, lte=255))] = SOURCE_SYSTEM
+    source_system: Annotated[int, CONNECTION, Parameter(validator=Number(gte=1, lte=255))] = 255
     """System id of this computer. Default: 255."""
 
     @property

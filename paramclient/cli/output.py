@@ -12,7 +12,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from enum import IntEnum
 from typing import ClassVar, Final, Self, TextIO
@@ -25,8 +25,9 @@ from paramclient.errors import ParamClientError
 from paramclient.model.names import first_of
 from paramclient.model.values import Param
 
-STDIN: Final = "stdin:"
-"""What `-` among the arguments becomes, which cyclopts would take for an option: the standard input."""
+STDIN: Final = "./-"
+"""What `-` among the arguments becomes, which cyclopts would take for an option: the standard input, or where
+only a file is possible, a file of this name."""
 
 LINE_NAMES_MAX: Final = 10
 """Parameters or vehicles that a line names, so that it stays short; it gives the number of further ones."""
@@ -291,9 +292,7 @@ class ExitCode(IntEnum):
     DONE = 0
     """The command succeeded."""
     INCOMPLETE = 1
-    """The vehicle refused something, or some parameters are missing."""
-    DIFFERENT = 1
-    """The compared parameters differ."""
+    """The vehicle refused something, some parameters are missing, or the compared ones differ."""
     USAGE = 2
     """The arguments are invalid."""
     NO_ANSWER = 3
@@ -332,10 +331,8 @@ _CODES: Final = {
 """Exit codes by class of error; the first class that matches applies."""
 
 
-def report_all(found: Iterable[ParamClientError], prefix: str = "") -> int:
+def report_all(found: Collection[ParamClientError], prefix: str = "") -> int:
     """Print every error; return the exit code for all of them."""
-    worst = ExitCode.DONE
     for error in found:
         report(f"{prefix}{text_of(error, takes_all=False)}")
-        worst = max(worst, code_of(error))
-    return worst
+    return max(map(code_of, found), default=ExitCode.DONE)

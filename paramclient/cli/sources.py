@@ -33,7 +33,6 @@ DEFAULTS: Final = "defaults"
 MEANING_LENGTH_MAX: Final = 40
 """Characters of the meaning of a value in a table. A bit mask of ArduPilot may have 30 names, and one such
 row would make the table wider than every screen."""
-_DEFAULTS: Final = LinkOptions()
 
 
 # Sources
@@ -139,7 +138,7 @@ async def save(
     only: tuple[str, ...] = (),
     incomplete: bool = False,
     metadata: MetadataFile = None,
-    options: LinkOptions = _DEFAULTS,
+    options: LinkOptions = LinkOptions(),
 ) -> int:
     """Write the parameters of a vehicle to a file, in the file format of any ground station.
 
@@ -217,7 +216,7 @@ async def diff(
     only: tuple[str, ...] = (),
     partial: bool = False,
     metadata: MetadataFile = None,
-    options: LinkOptions = _DEFAULTS,
+    options: LinkOptions = LinkOptions(),
 ) -> ExitCode:
     """Compare the parameters of two files, links or vehicles in the cache.
 
@@ -256,7 +255,7 @@ async def diff(
         say(_summary(found))
         if not (partial or outcome.is_same) and sources.is_file(left) != sources.is_file(right):
             say("--partial leaves out the parameters that the file does not have")
-    return ExitCode.DONE if outcome.is_same else ExitCode.DIFFERENT
+    return ExitCode.DONE if outcome.is_same else ExitCode.INCOMPLETE
 
 
 def _print(found: JsonObject) -> None:

@@ -211,6 +211,8 @@ def test_a_file_is_read_from_the_standard_input(
     outcome = command("diff", "quad.param", "-", "--json")
     assert (outcome.code, list(outcome.json["params"])) == (1, ["B"])
     assert outcome.json["right"]["source"] == "standard input"
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"A 1\nB 3\n")))
+    assert command("diff", "quad.param", "quad.param", "--base", "-").code == 0
 
 
 # Links
