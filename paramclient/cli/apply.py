@@ -21,7 +21,7 @@ from paramclient.cli.metadata import MetadataChoice, default_in, known_of_sessio
 from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import ExitCode, Status, can_ask, code_of, confirm, listed, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, check_given, get_chosen, sessions
-from paramclient.cli.set_command import write_all
+from paramclient.cli.set_command import interruptible
 from paramclient.cli.sources import described, filled, is_pattern_name, resolve_all
 from paramclient.files import FileFormat, ParamFile
 from paramclient.model.names import age_in_words, counted, is_pattern
@@ -38,6 +38,8 @@ _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be reve
 """Words for planned actions in the summary, where they differ from the status."""
 _INCLUDABLE: Final = frozenset(CATEGORIES) - {READ_ONLY}
 """Categories of left-out parameters that --include writes; the vehicle lets no client write the others."""
+
+
 _OPTIONS: Final = ApplyFlags()
 
 
@@ -292,16 +294,16 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
         for error in found.errors.values():
             if isinstance(error, errors.FileError):  # before anything is sent to another vehicle
                 raise error
-        if flags.dry_run or (not flags.yes and not flags.json and can_ask()):
-            plans = await found.work(lambda session: jobs[session].make_plan())
-            has_work = any(job.has_work for job in plans.values())
-            if flags.dry_run or has_work:
-                code = found.show(plans)
-            if flags.dry_run:
-                return code
-            if has_work and not await confirm("go on?"):
-                return ExitCode.INCOMPLETE
-        return await write_all(found, jobs)
+        with interruptible(found, jobs):
+            if flags.dry_run or (not flags.yes and not flags.json and can_ask()):
+                plans = await found.work(lambda session: jobs[session].make_plan())
+                if flags.dry_run:
+                    return found.show(plans)
+                if any(job.has_work for job in plans.values()):
+                    found.show(plans)
+                    if not await confirm("go on?"):
+                        return ExitCode.INCOMPLETE
+            return found.show(await found.work(lambda session: jobs[session].write()))
 
 
 @dataclass(eq=False)
@@ -313,6 +315,7 @@ class _Job:
         state: the values to write.
         options: the options of the run.
         has_work: whether the plan writes something.
+        has_begun: whether values may have been sent.
         found: the plan; while it is written, the outcomes so far; and at the end the result.
     """
 
@@ -322,6 +325,7 @@ class _Job:
     state: State
     options: ApplyOptions
     has_work: bool = False
+    has_begun: bool = False
     found: Rows = field(default_factory=lambda: Rows({}))
 
     async def make_plan(self) -> Self:
@@ -348,8 +352,10 @@ class _Job:
             if now.row is not None:
                 arrived[now.row.name] = now.row
                 status.count(now.done, now.total)
-            elif now.phase == "writing" and not (arrived or session.options.json):
-                say(f"writing to {session.receiver} on {session.client.link.name}")
+            elif now.phase == "writing" and not self.has_begun:
+                self.has_begun = True
+                if not session.options.json:
+                    say(f"writing to {session.receiver} on {session.client.link.name}")
 
         self.found, title = Rows(arrived), f"setting {session.label}"
         options = self.options | {"timeout": session.deadline.left(), "progress": update}
@@ -366,8 +372,7 @@ class _Job:
             return plan_json(self.found, self.session.component)
         if isinstance(self.found, ApplyResult):
             return apply_json(self.found, self.session.component)
-        rows = rows_json(self.found.rows.values())
-        return {**self.session.ids, "complete": False, "params": rows, "error": "interrupted"}
+        return {"complete": False, "params": rows_json(self.found.rows.values()), "error": "interrupted"}
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the cells of each row; those of a plan in the order of writing."""
@@ -387,7 +392,7 @@ class _Job:
         """
         found, session, options = self.found, self.session, self.options
         words = ", ".join(f"{count} {_WORDS.get(status, status)}" for status, count in found.counts.items())
-        summary, remarks = f"{session.receiver}: {words or 'nothing to set'}", list[str]()
+        remarks = list[str]()
         done = [row for row in found.rows.values() if row.status not in _WORDS]
         is_part = self.state.is_part or not all(row.is_as_wanted for row in done)
         code = ExitCode.INCOMPLETE if is_part else ExitCode.DONE
@@ -406,9 +411,9 @@ class _Job:
                 remarks.append(f"{found.error}; {self.state.to_continue}")
                 code = max(code, code_of(found.error))
         else:
-            say(f"{summary}; {self.state.to_continue}")
+            say(f"{session.receiver}: {words or 'nothing acknowledged'}; {self.state.to_continue}")
             return code
-        say(f"{summary}{end}")
+        say(f"{session.receiver}: {words or 'nothing to set'}{end}")
         if left_out := Counter(row.category for row in found.shown_rows if row.category in _INCLUDABLE):
             counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
             includes = " ".join(f"--include {category}" for category in left_out)

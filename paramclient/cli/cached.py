@@ -27,16 +27,14 @@ from paramclient.provision.sources import component_of, tables_in
 KIND_BYTES: Final = 4096
 """Bytes at the beginning of a file that identify its format."""
 
-_DEFAULTS: Final = CacheOptions()
 
-
-def cache_list(*, options: CacheOptions = _DEFAULTS) -> None:
+def cache_list(*, options: CacheOptions = CacheOptions()) -> None:
     """List the tables in the cache, most recently received vehicles first."""
     with ParamCache(options.cache) as cache:
         show_summaries(cache, cache.components(), json=options.json)
 
 
-def cache_remove(vehicle: str, /, *, options: CacheOptions = _DEFAULTS) -> None:
+def cache_remove(vehicle: str, /, *, options: CacheOptions = CacheOptions()) -> None:
     """Remove a vehicle from the cache: its tables and their history.
 
     Args:
@@ -79,7 +77,7 @@ def show_summaries(cache: ParamCache, summaries: Sequence[CachedSummary], *, jso
 # import
 
 
-async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS) -> int:
+async def import_(file: Path, /, *files: Path, options: CacheOptions = CacheOptions()) -> int:
     """Import logs into the cache: vehicles, tables and changes, with the times of the logs.
 
     Later values in the cache are kept, so neither order nor repetition matters. All files are tried even if
@@ -140,7 +138,7 @@ def history(
     since: str | None = None,
     snapshots: bool = False,
     extended: bool = False,
-    options: CacheOptions = _DEFAULTS,
+    options: CacheOptions = CacheOptions(),
 ) -> None:
     """Print the changes of a vehicle's values: time, old and new value, author. The newest change is last.
 
@@ -178,7 +176,7 @@ def history(
     found = [history_json(each) for each in entries]
     members = ("component", "name", "old", "new", "by")
     rows = ([local_time(each.at), *map(line.get, members)] for each, line in zip(entries, found, strict=True))
-    show({"history": found}, ["time", *members], rows, json=options.json)
+    show({"history": found}, ["time", *members], rows, json=options.json, empty="no changes are in the cache")
 
 
 def _snapshot_cells(each: SnapshotSummary) -> Sequence[object]:

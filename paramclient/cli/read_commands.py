@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -154,7 +154,7 @@ def _report_fetch(session: CommandSession, result: FetchResult, defaults: Sequen
     return ExitCode.INCOMPLETE
 
 
-def _report_get(session: CommandSession, errors: Iterable[ParamClientError]) -> int:
+def _report_get(session: CommandSession, errors: Collection[ParamClientError]) -> int:
     """Print a doubt about the values, and the errors; return the exit code."""
     if doubt := session.component.session.encoding_doubt:
         report(f"{session.prefix}{doubt}")
@@ -220,7 +220,7 @@ def _print(session: CommandSession, item: JsonObject, text: str) -> None:
     link = session.client.link
     now = (link.at if isinstance(link, ReplayLink) else None) or time.time()
     if session.options.json:
-        print_json({"time": time_text(now)} | (session.ids if session.choice.is_all else {}) | item)
+        print_json({"time": time_text(now)} | session.ids | item)
     else:
         print_line(f"{local_time(now)}  {text}")
 

@@ -19,7 +19,7 @@ from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, NoReply, ParamClientError, UnknownParameter, UsageError
 from paramclient.links import LinkKind
 from paramclient.model.identity import version_text
-from paramclient.model.names import NameChoice, first_of, is_pattern
+from paramclient.model.names import NameChoice, did_you_mean, is_pattern, nearest_names
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust, check_name
 from paramclient.protocol.fetch import FetchResult, Progress
@@ -31,11 +31,13 @@ VEHICLE_TIMEOUT: Final = 10.0
 RECHECK_TIMEOUT: Final = 2.5
 """Seconds to check that the vehicle is still the only one: no wait is needed unless the vehicle or the link
 was lost in between."""
-AWAITED_NAMES_MAX: Final = 3
-"""Parameters that the line about awaited values names."""
 OTHERS_TIMEOUT: Final = 2.5
 """Seconds in which a camera or another component beside an autopilot must give its first parameter, to be
 one of all."""
+QUICK_ROUND_TRIP: Final = 0.1
+"""Seconds up to which a round trip is that of UDP or USB, where a table takes 1 s; on a radio it takes 30."""
+SUGGESTION_TIMEOUT: Final = 2.0
+"""Seconds for a table that is fetched for similar names only."""
 FIRMWARE_TIMEOUT: Final = 0.5
 """Seconds to wait for the firmware version of the vehicle, to name it to the user or to find its metadata."""
 
@@ -139,9 +141,15 @@ class CommandSession:
         return f"{self.address} {autopilot}" if is_named else node_in_words(self.component.node)
 
     @property
+    def others(self) -> list[str]:
+        """Other vehicles of the link in words, if --vehicle did not choose the one that is used."""
+        heard = self.client.autopilots if self.options.vehicle is None else []
+        return [node_in_words(each.node) for each in heard if each.node is not self.component.node]
+
+    @property
     def prefix(self) -> str:
-        """The beginning of a line about the component: its label with --vehicle all, else ""."""
-        return f"{self.label}: " if self.choice.is_all else ""
+        """The beginning of a line about the component: its label if it may be one of several, else ""."""
+        return f"{self.label}: " if self.choice.is_all or self.others else ""
 
     @property
     def receiver(self) -> str:
@@ -253,17 +261,14 @@ class Sessions(list[CommandSession]):
         self.report_others()
         found = results.items()
         if not self[0].options.json:
-            is_named = self.is_all or bool(self.others)
-            named = [(session.address if is_named else None, result) for session, result in found]
+            named = [(session.address if session.prefix else None, result) for session, result in found]
             rows = [(address, *cells) for address, result in named for cells in result.rows()]
             if rows:
                 print_table(["vehicle", *next(iter(results.values())).columns], rows)
-        elif self.is_all:
-            vehicles = [session.ids | result.as_json() for session, result in found]
-            failures = [session.ids | {"error": str(error)} for session, error in self.errors.items()]
-            print_json({"vehicles": vehicles, "errors": failures})
         else:
-            print_json(results[self[0]].as_json())
+            items = [session.ids | result.as_json() for session, result in found]
+            failures = [session.ids | {"error": str(error)} for session, error in self.errors.items()]
+            print_json({"vehicles": items, "errors": failures} if self.is_all else items[0])
         return max([result.report() for result in results.values()] + [self.report_errors()])
 
     def report_errors(self) -> int:
@@ -271,21 +276,14 @@ class Sessions(list[CommandSession]):
         codes = [report_all([error], f"{session.label}: ") for session, error in self.errors.items()]
         return max(codes, default=ExitCode.DONE)
 
-    @property
-    def others(self) -> list[str]:
-        """Other vehicles of the link in words, if --vehicle did not choose the one that is used."""
-        client, own = self[0].client, self[0].component.node
-        heard = client.autopilots if self[0].options.vehicle is None else []
-        return [node_in_words(each.node) for each in heard if each.node is not own]
-
     def report_others(self) -> None:
         """Report other vehicles of the link, if --vehicle did not choose the one that was used.
 
         For subcommands that only read: they use the first vehicle heard, which may be another one next time.
         """
-        if self.others:
+        if others := self[0].others:
             used = f"{self[0].label} was used, the first vehicle heard"
-            report(f"{used}. Also on this link: {listed(self.others)}. --vehicle chooses one")
+            report(f"{used}. Also on this link: {listed(others)}. --vehicle chooses one")
 
 
 @asynccontextmanager
@@ -473,12 +471,28 @@ async def get_chosen(
         except ParamClientError as error:
             found[name] = error
 
-    with Status(f"waiting for {first_of(requested, AWAITED_NAMES_MAX)} of {session.label}"):
+    with Status(f"waiting for {listed(requested)} of {session.label}"):
         async with anyio.create_task_group() as tasks:
             for name in requested:
                 tasks.start_soon(read, name)
     errors = {name: each for name, each in found.items() if isinstance(each, ParamClientError)}
+    await suggest_names(session, errors.values())
     return [each for each in found.values() if isinstance(each, Param)], errors
+
+
+async def suggest_names(session: CommandSession, errors: Iterable[ParamClientError | None]) -> None:
+    """Name similar parameters in the errors about names that the vehicle does not have.
+
+    An error has none if the table was never fetched. It is fetched for that, but not over a slow link.
+    """
+    unknown = [each for each in errors if isinstance(each, UnknownParameter) and not each.nearest]
+    if not unknown or (session.component.round_trip or math.inf) > QUICK_ROUND_TRIP:
+        return
+    with suppress(NoReply):
+        await session.component.fetch_all(timeout=session.deadline.left(SUGGESTION_TIMEOUT))
+    for error in unknown:
+        if nearest := nearest_names(error.name or "", session.component.params):
+            error.nearest, error.args = nearest, (str(error).partition(":")[0] + did_you_mean(nearest),)
 
 
 def check_given(given: Iterable[str]) -> list[str]:
@@ -487,8 +501,7 @@ def check_given(given: Iterable[str]) -> list[str]:
     Raises:
         UsageError: a name is not a valid param_id.
     """
-    chosen = list(dict.fromkeys(given))
-    return [text if is_pattern(text) else check_name(text) for text in chosen]
+    return [text if is_pattern(text) else check_name(text) for text in dict.fromkeys(given)]
 
 
 def spelling(name: str, component: Component) -> str:

@@ -6,9 +6,9 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Final, Protocol, Self
+from typing import Annotated, ClassVar, Protocol, Self
 
 import anyio
 from cyclopts import Parameter
@@ -18,15 +18,13 @@ from paramclient.cli.json_output import JsonObject, info_of, outcome_json, vehic
 from paramclient.cli.metadata import MetadataChoice, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Status, code_of, report, require_consent, say
-from paramclient.cli.session import CommandSession, Sessions, Shown, sessions, spelling
+from paramclient.cli.session import CommandSession, Sessions, Shown, sessions, spelling, suggest_names
 from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.metadata.info import ParamInfo, number_of
 from paramclient.model.values import ParamType, Value, check_name, format_value, parse_ext_value
 from paramclient.protocol.set_results import SetOutcome, SetStatus
-
-_DEFAULTS: Final = LinkOptions()
 
 
 async def set_(
@@ -36,7 +34,7 @@ async def set_(
     settle: Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))] = 0.0,
     force: bool = False,
     metadata: MetadataChoice = None,
-    options: LinkOptions = _DEFAULTS,
+    options: LinkOptions = LinkOptions(),
 ) -> int:
     """Write parameters in the order given, and verify each by the value that the vehicle reports.
 
@@ -67,7 +65,8 @@ async def set_(
             receivers = ", ".join(session.receiver for session in found)
             question = f"Write these values to {receivers} all the same?"
             await require_consent(question, "--force writes these values all the same")
-        return await write_all(found, jobs)
+        with interruptible(found, jobs):
+            return found.show(await found.work(lambda session: jobs[session].write()))
 
 
 def _parse_pairs(words: Sequence[str]) -> dict[str, str]:
@@ -140,24 +139,23 @@ async def _type_of(session: CommandSession, name: str) -> ParamType | None:
 class WriteJob(Shown, Protocol):
     """What is written to one vehicle; `report` and the rows give the outcomes so far."""
 
+    has_begun: bool
+    """Whether values may have been sent."""
+
     async def write(self) -> Self:
         """Write the values, and return the job."""
 
 
-async def write_all(found: Sessions, jobs: Mapping[CommandSession, WriteJob]) -> int:
-    """Write to all vehicles; print the outcomes, also those so far after an interruption.
-
-    Returns:
-        The exit code.
-
-    Raises:
-        ParamClientError: nothing was written to the only vehicle.
-    """
+@contextmanager
+def interruptible(found: Sessions, jobs: Mapping[CommandSession, WriteJob]) -> Iterator[None]:
+    """After an interruption of the block, print the outcomes so far, or that nothing was sent."""
     try:
-        return found.show(await found.work(lambda session: jobs[session].write()))
+        yield
     except anyio.get_cancelled_exc_class():
-        found.show(jobs)
-        say("interrupted: the values without a proof may be in flight")
+        has_begun = any(job.has_begun for job in jobs.values())
+        if has_begun or found[0].options.json:
+            found.show(jobs)
+        say(f"interrupted: {'values without a proof may be in flight' if has_begun else 'nothing was sent'}")
         raise
 
 
@@ -172,6 +170,7 @@ class SetJob:
         writes: the values by name.
         doubts: sentences on values outside the range, and on fractions for integers.
         outcomes: one for each value by name; *unknown* for those without one so far.
+        has_begun: whether values may have been sent.
     """
 
     columns: ClassVar[Sequence[str]] = ("name", "requested", "actual", "status", "reason")
@@ -183,6 +182,7 @@ class SetJob:
     writes: dict[str, Value] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
     outcomes: dict[str, SetOutcome] = field(default_factory=dict)
+    has_begun: bool = False
 
     async def write(self) -> Self:
         """Write the values, and return the job, in which each has an outcome.
@@ -193,6 +193,7 @@ class SetJob:
         """
         session, numbers = self.session, itertools.count(1)
         await session.check_only()
+        self.has_begun = True
         self.outcomes = {pair[0]: SetOutcome(*pair, SetStatus.UNKNOWN) for pair in self.writes.items()}
 
         def update(outcome: SetOutcome) -> None:
@@ -204,6 +205,7 @@ class SetJob:
             done = await session.component.set_many(
                 self.writes, progress=update, timeout=timeout, settle=self.settle, force=self.force
             )
+        await suggest_names(session, [each.error for each in done.outcomes])
         self.outcomes = {each.name: each for each in done.outcomes}
         return self
 

@@ -425,6 +425,30 @@ def test_ctrl_c_prints_the_outcomes_so_far(
     assert set(vehicle.values.values()) == {2}
 
 
+@pytest.mark.parametrize("at", [messages.ParamRequestList, messages.ParamSet])
+@pytest.mark.parametrize("as_json", [False, True])
+def test_ctrl_c_before_the_first_outcome_says_whether_something_was_sent(
+    command: Command, put: Put, file: File, at: type[messages.Message], as_json: bool
+) -> None:
+    class Interrupted(GenericVehicle):
+        """A vehicle at whose first message of a kind the user presses Ctrl-C."""
+
+        def respond(self, message: messages.Message, sender: frames.Frame) -> None:
+            if isinstance(message, at):
+                signal.raise_signal(signal.SIGINT)
+            else:
+                super().respond(message, sender)
+
+    outcome = command("apply", put(Interrupted({"A": 1})), file("A,2\n"), *(["--json"] if as_json else []))
+    is_sent = at is messages.ParamSet
+    end = "values without a proof may be in flight" if is_sent else "nothing was sent"
+    assert (outcome.code, outcome.err.endswith(f"interrupted: {end}\n")) == (130, True), outcome.err
+    assert ("nothing acknowledged; run it again to continue" in outcome.err) == (is_sent or as_json)
+    assert ("writing to" in outcome.err) == (is_sent and not as_json)
+    if as_json:
+        assert (outcome.json["complete"], outcome.json["params"]) == (False, {})
+
+
 def test_an_interrupted_restore_is_continued_by_its_number(command: Command, put: Put, file: File) -> None:
     names = [f"P{number:02}" for number in range(40)]
     wanted = file("".join(f"{name},2\n" for name in names))

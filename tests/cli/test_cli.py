@@ -222,7 +222,7 @@ def test_watch_prints_lines_of_json_as_values_change(live_command: Command, tmp_
         assert done.code == 0
         change = strict(line_of(watching.stdout))
         assert abs(datetime.fromisoformat(change.pop("time")).timestamp() - time.time()) < TIMEOUT
-        values = {"old": 4.0, "new": "NaN"}
+        values = {"system": 1, "component": 1, "old": 4.0, "new": "NaN"}
         assert change == {"name": "MC_ROLL_P", **values, "by": "vehicle", "kind": "changed"}
         watching.send_signal(signal.SIGINT)
         outcome = ended(watching)
@@ -261,7 +261,7 @@ def test_watch_prints_events_of_the_vehicle(command: Command, put: Put) -> None:
         {"event": "lost", **where, "silence_s": pytest.approx(5.0, abs=0.1)},
         {"event": "found", **where, "silence_s": pytest.approx(9.0, abs=1.5)},
         {"event": "rebooted", **where},
-        {"name": "B", "old": 2, "new": 3, "by": "vehicle", "kind": "changed"},
+        {**where, "name": "B", "old": 2, "new": 3, "by": "vehicle", "kind": "changed"},
         {"event": "resynced", **where, "changed": ["B"], "hash": crc},
     ]
 
@@ -477,6 +477,13 @@ def test_the_help_of_fetch_fits_on_a_screen_with_the_connection_last() -> None:
     assert [line.split()[1] for line in lines if line.startswith("╭")] == [
         *("Arguments", "Parameters", "Connection"),
     ]
+
+
+def test_help_wraps_at_the_terminal_and_has_no_examples_of_other_subcommands() -> None:
+    narrow = {**PLAIN, "COLUMNS": "80"}
+    assert "\nparameter also text, or bytes as hex:00FF. " in run_process("set", "--help", env=narrow).out
+    for words in (["cache"], ["metadata", "list", "--help"]):
+        assert "Examples:" not in run_process(*words, env=narrow).out
 
 
 def test_the_module_runs_the_command_line() -> None:

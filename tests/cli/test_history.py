@@ -105,6 +105,7 @@ def test_history_prints_the_cached_changes_since_a_time(command: Command) -> Non
         [first, "1", "A", "1", "2", "us"],
     ]
     second = time_text(HOUR_AGO + 900)
+    assert command("history", "1", "--since", "0s ago").err == "no changes are in the cache\n"
     since = command("history", "1/1", "--since", second, "--json").json["history"]
     assert [each["name"] for each in since] == ["B"]
     since = command("history", "1", "--since", first, "--json").json["history"]

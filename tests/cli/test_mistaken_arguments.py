@@ -50,6 +50,7 @@ NO_VALUE = "set takes pairs of NAME and VALUE, or NAME=VALUE"
         ("save sim:px4 new.param --format exe", 'Invalid value "exe" for --format. Choose from: "qgc"'),
         ("save 1 new.param --no-cache", "'1' is a vehicle in the cache, which --no-cache excludes"),
         ("fect sim:px4", 'Unknown command "fect". Did you mean "fetch"?'),
+        ("metadata add -", "-: cannot be read: No such file"),
         ("history", 'Command "history" parameter VEHICLE requires an argument.'),
         ("get MC_ROLL_P", 'Command "get" parameter NAME requires an argument. Usage: paramclient get'),
     ],
@@ -89,6 +90,21 @@ def test_an_unknown_name_has_one_exit_code_and_a_suggestion(
     assert done.code == 2
     assert "did you mean MC_ROLL_P?" in done.out + done.err
     assert "writing to" not in done.err
+
+
+@pytest.mark.parametrize(
+    "words", [["get", "MC_ROLL_PP"], ["set", "MC_ROLL_PP", 5]], ids=lambda words: words[0]
+)
+def test_a_first_command_suggests_names_too_but_downloads_nothing_over_a_slow_link(
+    command: Command, put: Put, words: tuple[object, ...]
+) -> None:
+    for delay, is_fetched in ((0.0, True), (0.2, False)):
+        vehicle = PX4Vehicle(table={"MC_ROLL_P": 4.0, "MC_YAW_P": 2.0})
+        url = put(Air.symmetric([vehicle], delay=delay))
+        done = command(words[0], url, *words[1:], "--no-cache")
+        assert done.code == 2
+        assert ("has no MC_ROLL_PP; did you mean MC_ROLL_P?" in done.out + done.err) == is_fetched
+        assert bool(vehicle.requests["PARAM_REQUEST_LIST"]) == is_fetched
 
 
 def test_a_text_that_is_neither_a_number_nor_a_known_name_is_quoted(command: Command) -> None:

@@ -66,6 +66,7 @@ def test_a_read_says_which_vehicle_it_shows(command: Command, put: Put) -> None:
         r"--vehicle chooses one\n",
         several.err,
     )
+    assert command("get", url, "A", "--json").json["system"] in (1, 4)
     named = command("fetch", url, "--vehicle", 1)
     assert (named.rows[0][0], "Also on this link" in named.err) == ("name", False)
 
@@ -166,19 +167,20 @@ def test_save_writes_every_vehicle_into_one_file_or_into_one_each(
     assert all("A" in read_file(path).choose() for path in paths)
 
 
-def test_watch_prints_the_changes_of_every_vehicle(command: Command, put: Put) -> None:
+def test_watch_prints_of_which_vehicle_a_change_is(command: Command, put: Put) -> None:
     def watch(*words: str) -> list[str]:
         vehicles = px4(), px4(2)
         url = put(Air([Eventful(each, (6.0, partial(each.set_param, "A", 3.0))) for each in vehicles]))
-        watched = command("watch", url, "A", "--vehicle", "all", "--timeout", 20, *words)
+        watched = command("watch", url, "A", "--timeout", 20, *words)
         assert watched.code == 0, watched.err
         return watched.out.splitlines()
 
-    assert sorted(line.partition("  ")[2] for line in watch()) == [
+    assert sorted(line.partition("  ")[2] for line in watch("--vehicle", "all")) == [
         "1/1 px4: A  1.0 -> 3.0  (vehicle)",
         "2/1 px4: A  1.0 -> 3.0  (vehicle)",
     ]
-    assert {strict(line)["system"] for line in watch("--json")} == {1, 2}
+    assert {strict(line)["system"] for line in watch("--vehicle", "all", "--json")} == {1, 2}
+    assert re.fullmatch(r"[12]/1 px4: A  1\.0 -> 3\.0  \(vehicle\)", watch()[-1].partition("  ")[2])
 
 
 # Vehicles of the cache
