@@ -346,24 +346,20 @@ def open_client(url: str, options: TrafficOptions, **more: Any) -> ParamClient:
 async def _with_parameters(components: Sequence[Component]) -> list[Component]:
     """Return the components that have a parameter, and print a line for each other."""
 
-    async def ask(component: Component) -> None:
-        async def read(index: int) -> None:
-            with suppress(NoReply, UnknownParameter):
-                await component.get(index, timeout=OTHERS_TIMEOUT)
-                tasks.cancel_scope.cancel()
-
-        async with anyio.create_task_group() as tasks:
-            for first in (0, 1):  # some begin at 1
-                tasks.start_soon(read, first)
-        if component.count is None:
-            noun, hint = "parameters", "; --extended uses extended ones"
-            if component.is_extended:
-                noun, hint = "extended parameters", ""
-            say(f"{node_in_words(component.node)} has no {noun}, or none within {OTHERS_TIMEOUT:g} s{hint}")
+    async def ask(component: Component, index: int) -> None:
+        with suppress(NoReply, UnknownParameter):
+            await component.get(index, timeout=OTHERS_TIMEOUT)
 
     async with anyio.create_task_group() as tasks:
         for each in components:
-            tasks.start_soon(ask, each)
+            for first in (0, 1):  # some begin at 1
+                tasks.start_soon(ask, each, first)
+    for each in components:
+        if each.count is None:
+            hint = "" if each.is_extended else "; --extended uses extended ones"
+            say(
+                f"{node_in_words(each.node)} has no {noun_of(each)}s, or none within {OTHERS_TIMEOUT:g} s{hint}"
+            )
     return [each for each in components if each.count is not None]
 
 
