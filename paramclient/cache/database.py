@@ -159,8 +159,7 @@ class Transaction:
 
     def all(self, sql: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
         """Run a statement and return its rows."""
-        rows: list[tuple[Any, ...]] = self._connection.execute(self._marked(sql), values).fetchall()
-        return rows
+        return list(self._connection.execute(self._marked(sql), values))
 
     def do(self, sql: str, values: Sequence[object] = ()) -> int:
         """Run a statement and return the number of rows that it changed."""

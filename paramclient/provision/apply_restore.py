@@ -130,10 +130,9 @@ def load_restore_point(
             raise missing
         restores = [each for each in snapshots if each.reason == BEFORE_RESTORE and each.id > point.id]
         if restores:
-            now = time.time()
-            ago = age_in_words(now - restores[-1].at)
+            restored, applied = (age_in_words(time.time() - each.at) for each in (restores[-1], point))
             raise AlreadyRestored(
-                f"a restore ran {ago} ago, after the last apply ({age_in_words(now - point.at)} ago)",
+                f"a restore ran {restored} ago, after the last apply ({applied} ago)",
                 before_apply=point.id,
                 before_restore=restores[-1].id,
                 restored_at=restores[-1].at,
