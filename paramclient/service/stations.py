@@ -415,7 +415,7 @@ def parse_endpoint(text: str) -> MavlinkEndpoint:
     options = dict(each.partition("=")[::2] for each in query.split("&") if each)
     for each, value in options.items():
         if each not in ("readonly", "trusted", "sign") or bool(value) != (each == "sign"):
-            what = "is not an option of an endpoint; these are readonly, trusted and sign=KEYFILE"
-            raise UsageError(f"{each!r} {what}")
+            given = f"{each}={value}".rstrip("=")
+            raise UsageError(f"{given!r} is not an option; those are readonly, trusted and sign=KEYFILE")
     key = read_key(options["sign"]) if "sign" in options else None
     return MavlinkEndpoint(link, is_readonly="readonly" in options, is_trusted="trusted" in options, key=key)
