@@ -131,7 +131,7 @@ LOCK_WAIT_MAX: Final = 5.0
 WAL_SWITCH_INTERVAL: Final = 0.01
 """Seconds between two attempts to switch a new file to WAL mode: SQLite does not wait for other processes."""
 
-_PARTS: Final = ("", "-wal", "-shm")
+_PARTS: Final = ("-shm", "-wal", "")
 _DAMAGE: Final = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
 # Error codes if no -wal or -shm can be created: the folder is read-only, or the disk is full.
 _UNWRITABLE: Final = frozenset(
@@ -344,9 +344,6 @@ class SqliteStore(Store):
             return status.st_dev, status.st_ino
         return None
 
-    def _part(self, suffix: str) -> Path:
-        return self._path.with_name(self._path.name + suffix)
-
     def _set_aside(self, kind: str) -> None:
         """Rename the file that was open, with its -wal and -shm; unless another process has done so."""
         if self._which() != self._file:
@@ -355,9 +352,9 @@ class SqliteStore(Store):
         names = (f"{self._path.name}.{kind}-{stamp}-{number}" for number in itertools.count(1))
         name = next(each for each in names if not self._path.with_name(each).exists())
         try:
-            for suffix in reversed(_PARTS):
+            for suffix in _PARTS:
                 with suppress(FileNotFoundError):
-                    self._part(suffix).rename(self._path.with_name(name + suffix))
+                    Path(f"{self._path}{suffix}").rename(self._path.with_name(name + suffix))
         except OSError as error:
             raise CacheError(f"the cache {self.place} is {kind}, and cannot be renamed: {error}") from error
         self.notes.append(f"the cache {self.place} is {_KINDS[kind]}. It is kept as {name}; a new one begins")
