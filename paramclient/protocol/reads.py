@@ -102,8 +102,9 @@ async def _ask(
     """Request a parameter until it is received, and learn whether such reads are answered.
 
     Few attempts suffice where another way is left: before anything was ever answered, where such reads were
-    not answered before, and for a hash beside other answers. One that is asked for already is awaited first.
-    Where the round trip is long and silence would mean something, several copies are sent at once.
+    not answered before, and for a hash that was not confirmed on this link. One that is asked for already is
+    awaited first. Where the round trip is long and silence would mean something, several copies are sent at
+    once.
     """
     channel, dialect = session.channel, session.dialect
     is_served = session.serves_reads.get(type(which))
@@ -132,7 +133,8 @@ async def _ask(
 
     wait, timing = queue_time(session), channel.timing
     is_certain, singles = bool(is_served) and not requests, 1 if requests else BACKOFF_FROM
-    is_first = is_served is None and (timing.round_trip is None) != (which == HASH_CHECK)
+    may_be_off = which == HASH_CHECK and (session.table.hash is None or bool(session.table.unverified()))
+    is_first = is_served is None and (timing.round_trip is None) != may_be_off
     if is_asked:
         answer: ReportedValue | None = await channel.wait_for(inbox, accept, anyio.current_time(), 0, wait)
         if answer is not None:

@@ -272,6 +272,19 @@ async def test_a_link_that_was_disconnected_is_checked_like_a_loss(seconds: floa
         assert bits(component.params) == bits(vehicle.params)
 
 
+async def test_a_hash_that_is_lost_several_times_is_no_reason_for_a_download() -> None:
+    """The vehicle has confirmed its table by one, and many packets are lost."""
+    tap = Tap(PX4Vehicle())
+    async with fetched(Air.symmetric([tap], delay=0.02, loss=0.2), watch_interval=5.0) as (_, component):
+        tap.received.clear()
+        tap.is_deaf = True
+        await until(lambda: hashes(tap) == 5, pause=0.01)
+        tap.is_deaf = False
+        await asyncio.sleep(15.0)
+        assert component.sync_state is SyncState.SYNCED
+        assert not tap.messages(ParamRequestList)
+
+
 async def test_a_watch_survives_a_link_that_drops_during_a_check() -> None:
     tap = Tap(vehicle := small_px4())
     link = FlakyLink(tap)
