@@ -6,7 +6,7 @@
 - `tables`: reads and updates of tables, import by time.
 - `history`: lines of changes, values at an earlier time.
 - `snapshots`: snapshots, and tables at an earlier time.
-- `lookup`: vehicles by system id, address, kind, hardware id or key.
+- `lookup`, `moments`: vehicles by system id, address, kind, hardware id or key; times in a user's words.
 """
 
 from __future__ import annotations

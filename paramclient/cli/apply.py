@@ -336,7 +336,7 @@ class _Job:
         """
         session, left = self.session, self.session.deadline.left()
         include, info = self.options["include"], self.options["info"]
-        with anyio.move_on_after(left):
+        with Status(f"reading {session.label}"), anyio.move_on_after(left):
             self.found = made = await plan(session.component, self.state.params, include=include, info=info)
             is_refused = made.problems and not self.options["partial"]
             is_reboot_due = self.options["reboot"] and made.awaiting_reboot

@@ -256,7 +256,7 @@ class Status:
         now = self._loop.time()
         began, before = self._first = self._first or (now, received)
         self._progress = f"{self._title} {received}/{total or '?'}"
-        if elapsed := now - began:
+        if (elapsed := now - began) > NOTICE_INTERVAL / 2:  # a shorter one may be a burst
             rate = (received - before) / elapsed
             self._progress += f" {rate:.0f}/s"
             if rate and total:

@@ -226,18 +226,13 @@ class Sessions(list[CommandSession]):
         super().__init__(sessions)
         self.errors: dict[CommandSession, ParamClientError] = {}
 
-    @property
-    def is_all(self) -> bool:
-        """Whether all vehicles of the link are meant."""
-        return self[0].choice.is_all
-
     async def work(self, work: Callable[[CommandSession], Awaitable[Result]]) -> dict[CommandSession, Result]:
         """Work on all vehicles concurrently; return the results. A failure of one does not stop the others.
 
         Raises:
             ParamClientError: the error of the vehicle, without --vehicle all.
         """
-        if not self.is_all:
+        if not self[0].choice.is_all:
             return {self[0]: await work(self[0])}
         found: dict[CommandSession, Result] = {}
 
@@ -268,7 +263,7 @@ class Sessions(list[CommandSession]):
         else:
             items = [session.ids | result.as_json() for session, result in found]
             failures = [session.ids | {"error": str(error)} for session, error in self.errors.items()]
-            print_json({"vehicles": items, "errors": failures} if self.is_all else items[0])
+            print_json({"vehicles": items, "errors": failures} if self[0].choice.is_all else items[0])
         return max([result.report() for result in results.values()] + [self.report_errors()])
 
     def report_errors(self) -> int:
@@ -357,9 +352,8 @@ async def _with_parameters(components: Sequence[Component]) -> list[Component]:
     for each in components:
         if each.count is None:
             hint = "" if each.is_extended else "; --extended uses extended ones"
-            say(
-                f"{node_in_words(each.node)} has no {noun_of(each)}s, or none within {OTHERS_TIMEOUT:g} s{hint}"
-            )
+            none = f"has no {noun_of(each)}s, or none within {OTHERS_TIMEOUT:g} s"
+            say(f"{node_in_words(each.node)} {none}{hint}")
     return [each for each in components if each.count is not None]
 
 

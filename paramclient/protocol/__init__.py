@@ -11,5 +11,5 @@
 - `identity`, `presence`: who the vehicle is, and of which kind; lost, found, rebooted.
 - `commands`: COMMAND_LONG, requested messages, reboots.
 - `selection`: the vehicle that a call without an address means.
-- `addresses`, `events`: addresses and peers; changes of parameters, events of components.
+- `addresses`: addresses and peers.
 """

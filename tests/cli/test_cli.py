@@ -551,12 +551,18 @@ def on_terminal(*arguments: object, **environment: str) -> Outcome:
         os.close(ours)
 
 
-def test_a_rate_is_that_of_a_while(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rate_is_that_of_a_while(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     shown = command("fetch", "sim:px4?rate=10000", "--no-cache").err
     rates = [*map(int, re.findall(r"/903 ([0-9]+)/s", shown))]
     assert len(rates) > 5
     assert max(rates) < 400  # a parameter takes 37 bytes
+    file = tmp_path / "quad.parm"
+    file.write_text("MC_ROLL_P 6\nMC_YAW_P 2\n")
+    shown = command("apply", "sim:px4?rate=10000", file, "--dry-run", "--no-cache").err
+    assert "\x1b[Kreading 1/1 px4 (" in shown
+    shown = command("apply", "sim:px4?rate=10000", file, "--yes", "--no-cache").err
+    assert "\x1b[Ksetting 1/1 px4 2/2\r" in shown, "without the rate of two at once"
 
 
 def test_progress_is_drawn_on_a_terminal(tmp_path: Path) -> None:
