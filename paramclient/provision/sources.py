@@ -280,7 +280,7 @@ def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> Par
         of = "" if table.count is None else f" of {table.count}"
         others = sum(param.index is None for param in table.params.values()) if of else 0
         are = f"{table.size - others}{of} parameters are in the cache"
-        are += f", and {others} that were read by name" if others else ""
+        are += f", and {others} read by name" if others else ""
         source = f"{source}: {are}"
         if not partial:
             message = f"{table.system}/{table.component} is incomplete: {are}"

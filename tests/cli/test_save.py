@@ -86,7 +86,7 @@ def test_cached_parameters_outside_of_the_list_are_counted_apart(
     vehicle = PX4Vehicle(table=dict.fromkeys("ABCD", 1), not_in_use=["C", "D"])
     assert command("get", put(vehicle), "A", "C", "D").code == 0
     refused = command("save", "1", tmp_path / "quad.json")
-    assert "incomplete: 1 of 2 parameters are in the cache, and 2 that were read by name" in refused.err
+    assert "incomplete: 1 of 2 parameters are in the cache, and 2 read by name" in refused.err
 
 
 @pytest.mark.parametrize("ending", ["params", "param", "json"])
