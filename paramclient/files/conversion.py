@@ -160,15 +160,13 @@ def read_file(
 
 
 def _read(reading: Reading, file_format: FileFormat | str | None) -> ParamFile:
-    given = None if file_format is None else FileFormat(file_format)
     if len(reading.data) > LARGEST_FILE:
         raise FileError(f"a parameter file has at most {LARGEST_FILE} bytes", source=reading.source)
     try:
-        chosen = given or _format_of(reading)
+        chosen = _format_of(reading) if file_format is None else FileFormat(file_format)
         return _FORMATS[chosen].read(reading, chosen)
     except FileError as error:
-        kind = kind_of(reading.data)
-        if kind is None:
+        if (kind := kind_of(reading.data)) is None:
             raise
         raise FileError(f"not a parameter file: {kind}", source=reading.source) from error
 

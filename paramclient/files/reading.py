@@ -216,8 +216,8 @@ def decode_text(data: bytes, source: str) -> str:
     try:
         text = data.decode("utf-16") if is_utf16 else data.decode("utf-8-sig", "surrogateescape")
     except UnicodeDecodeError as error:
-        found = f"the byte 0x{data[error.start]:02x}"
-        raise FileError(f"expected UTF-16 text, found {found}", source=source) from None
+        message = f"expected UTF-16 text, found the byte 0x{data[error.start]:02x}"
+        raise FileError(message, source=source) from None
     if control := _control.search(text):
         line = text.count("\n", 0, control.start()) + 1
         message = f"expected text, found the character 0x{ord(control[0]):02x}: unknown file format"
