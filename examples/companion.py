@@ -65,7 +65,8 @@ def service(port: str, folder: Path) -> Iterator[tuple[str, str]]:
     token = subprocess.run(
         [*COMMAND, "token", "companion", "--file", tokens], check=True, capture_output=True, text=True
     ).stdout.strip()
-    options = ["--listen", "127.0.0.1:0", "--cache", folder / "cache.sqlite3", "--tokens", tokens]
+    options: list[str | Path] = ["--listen", "127.0.0.1:0", "--tokens", tokens]
+    options += ["--cache", folder / "cache.sqlite3"]
     command = [*COMMAND, "serve", f"serial:{port}:115200", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as serving:
         try:
