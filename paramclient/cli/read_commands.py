@@ -192,7 +192,8 @@ async def _watch(session: CommandSession, given: Sequence[str], found: Sessions)
         if errors:
             return report_all(errors.values(), session.prefix)
         is_first = set(component.params)
-    everything = counted(len(component.params), noun_of(component))
+    noun, size = noun_of(component), len(component.params)
+    everything = f"all {noun}s" if is_first is None else counted(size, noun)
     say(f"watching {', '.join(given) or everything} of {session.label}")
     if session is found[0]:
         found.report_others()

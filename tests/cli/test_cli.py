@@ -266,6 +266,11 @@ def test_watch_prints_events_of_the_vehicle(command: Command, put: Put) -> None:
     ]
 
 
+def test_watch_does_not_count_the_parameters_of_a_log_before_it_is_read(command: Command) -> None:
+    watched = command("watch", f"replay:{ROOT}/tests/data/px4_20_sets.tlog?speed=0", "--no-cache")
+    assert (watched.code, watched.err) == (0, "watching all parameters of 1/1 px4\n")
+
+
 def test_a_link_that_fails_during_watch_is_reported_once(command: Command, put: Put) -> None:
     def fail() -> None:
         raise LinkError("it is gone", link=URL)
