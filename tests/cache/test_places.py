@@ -14,17 +14,7 @@ import pytest
 from paramclient.cache import ParamCache
 from paramclient.errors import CacheError, UsageError
 from tests.cache.conftest import Open
-from tests.caches import (
-    CACHE_ALONE,
-    NOW,
-    read_only,
-    rubbish,
-    set_aside,
-    stored,
-    update,
-    values,
-    whole_table,
-)
+from tests.caches import CACHE_ALONE, NOW, read_only, rubbish, set_aside, stored, update, values, whole_table
 
 
 @pytest.fixture
