@@ -9,13 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from paramclient.model.comparison import (
-    ChangedSide,
-    DifferenceStatus,
-    compare,
-    defaults_of,
-    same_value,
-)
+from paramclient.model.comparison import ChangedSide, DifferenceStatus, compare, defaults_of, same_value
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, from_bits
 

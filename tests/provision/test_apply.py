@@ -14,26 +14,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from paramclient import ParamCache, ParamClient
-from paramclient.errors import (
-    AnotherVehicle,
-    CacheError,
-    LinkError,
-    NoReply,
-    UsageError,
-    VehicleArmed,
-)
+from paramclient.errors import AnotherVehicle, CacheError, LinkError, NoReply, UsageError, VehicleArmed
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import ParamType
 from paramclient.protocol.ftp import Opcode, Packet
-from paramclient.provision import (
-    MISSING,
-    ApplyProgress,
-    ApplyResult,
-    ApplyStatus,
-    apply,
-    plan,
-    restore,
-)
+from paramclient.provision import MISSING, ApplyProgress, ApplyResult, ApplyStatus, apply, plan, restore
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
 from paramclient.wire import frames, messages
 from tests.shell import FlakyLink, Tap, a_client, clamped, in_simulated_time, residue
