@@ -261,27 +261,6 @@ def test_invalid_names_and_values_are_refused(check: Any, argument: Any, words: 
 # Param
 
 
-def test_equality_compares_bits_so_nan_equals_itself() -> None:
-    one, other = param(0x7FC00000, math.nan), param(0x7FC00000, float("nan"))
-    assert one == other
-    assert hash(one) == hash(other)
-    assert one != param(0x7FC00001, math.nan)
-    for difference in ({"name": "Q"}, {"index": 1}, {"index": None}, {"trust": Trust.CACHED}):
-        assert param() != param(**difference)
-
-
-def test_same_value() -> None:
-    assert param(0, 0.0).same_value(param(0x80000000, -0.0, name="Q", index=None))
-    assert not param(0, 0, ParamType.INT32).same_value(param(0x80000000, -(2**31), ParamType.INT32))
-    assert not param(1, 1, ParamType.UINT8).same_value(param(1, 1, ParamType.INT8))
-    raw = decode_value(struct.pack("<f", 2.0**32), ParamType.UINT32, C_CAST)
-    number = decode_value(struct.pack("<f", float(raw[1])), ParamType.UINT32, C_CAST)
-    assert raw[1] == number[1]
-    assert not param(raw[1], raw[0], ParamType.UINT32).same_value(
-        param(number[1], number[0], ParamType.UINT32)
-    )
-
-
 @thorough
 @given(patterns, patterns)
 def test_same_bits_compares_numbers_by_value_and_nans_by_bits(a: int, b: int) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 from pymavlink.generator.mavcrc import x25crc_slow
 
-from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, enum_word, message_name
+from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, message_name
 from paramclient.wire.messages import (
     DECODED_IDS,
     AutopilotVersion,
@@ -435,14 +435,3 @@ def test_the_position_of_time_boot_ms_in_each_message(number: int) -> None:
         frame = one_frame(pack(of_pymavlink(number, time_boot_ms=boot_ms)))
         at = BOOT_CLOCK_OFFSETS[number]
         assert int.from_bytes(frame.payload[at : at + 4], "little") == boot_ms
-
-
-def test_requests_and_times_of_applications_are_no_clocks() -> None:
-    assert {2, 30, 32, 33, 83} <= BOOT_CLOCK_OFFSETS.keys()
-    assert BOOT_CLOCK_OFFSETS.keys().isdisjoint({84, 86, 251, 252, 254, 263})
-
-
-def test_values_of_an_enumeration_in_words() -> None:
-    words = [enum_word("MAV_AUTOPILOT", number) for number in range(256)]
-    assert (words[3], words[255]) == ("ardupilotmega", "autopilot 255")
-    assert "enum end" not in words

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import copy
-import hashlib
 import pickle
 import struct
 from typing import Any
@@ -115,15 +114,6 @@ def test_the_repr_of_a_key_does_not_show_it() -> None:
         with pytest.raises(TypeError, match="not pickled"):
             pickle.dumps(KEY, protocol)
     assert copy.copy(KEY) is copy.deepcopy(KEY) is KEY
-
-
-def test_keys_are_equal_by_their_bytes_and_distinguished_by_their_fingerprints() -> None:
-    assert SigningKey(SECRET) == KEY != OTHER_KEY
-    assert KEY != SECRET
-    assert len({SigningKey(SECRET), KEY, OTHER_KEY}) == 2
-    assert KEY.fingerprint != OTHER_KEY.fingerprint
-    assert len(bytes.fromhex(KEY.fingerprint)) == 8
-    assert not hashlib.sha256(SECRET).hexdigest().startswith(KEY.fingerprint)
 
 
 # Beside pymavlink
