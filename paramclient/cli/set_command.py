@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial as bind
 from typing import Annotated, ClassVar, Protocol, Self
 
 import anyio
@@ -57,12 +58,12 @@ async def set_(
     """
     texts = _parse_pairs(pairs)
     async with sessions(url, options, writes=True) as found:
-        jobs = {each: await _prepare(each, texts, metadata, settle=settle, force=force) for each in found}
+        jobs = await found.work(bind(_prepare, texts=texts, choice=metadata, settle=settle, force=force))
         doubts = dict.fromkeys(doubt for job in jobs.values() for doubt in job.doubts)
         for doubt in doubts:
             report(doubt)
         if doubts and not force:
-            receivers = ", ".join(session.receiver for session in found)
+            receivers = ", ".join(session.receiver for session in jobs)
             question = f"Write these values to {receivers} all the same?"
             await require_consent(question, "--force writes these values all the same")
         with interruptible(found, jobs):

@@ -137,6 +137,14 @@ def test_one_vehicle_that_fails_stops_no_other(command: Command, put: Put) -> No
     assert (watched.code, "paramclient: 3/1 px4: " in watched.err) == (3, True)
 
 
+def test_a_value_without_a_meaning_on_one_vehicle_is_set_on_the_others(command: Command, put: Put) -> None:
+    vehicles = PX4Vehicle(metadata=True), copter()
+    done = command("set", put(Air(vehicles)), "COM_FLTMODE1=Return", "--vehicle", "all", "--json")
+    assert (done.code, vehicles[0].values["COM_FLTMODE1"]) == (2, 5)
+    assert [each["system"] for each in done.json["vehicles"]] == [1]
+    assert "paramclient: 4/1 ardupilot: 'Return' is not a number." in done.err
+
+
 def test_set_and_reset_write_to_every_vehicle(command: Command, put: Put, tmp_path: Path) -> None:
     vehicles = px4(table=TABLE | {"OF_PX4": 1.5}), copter(ftp=False)
     url = put(Air(vehicles))
