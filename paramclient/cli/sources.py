@@ -253,7 +253,8 @@ async def diff(
             if params is not None:
                 say(f"{side}: {described(params)}")
         say(_summary(found))
-        if not (partial or outcome.is_same) and sources.is_file(left) != sources.is_file(right):
+        has_more = any(number for kind, number in found["counts"].items() if kind.startswith("only"))
+        if has_more and not partial and sources.is_file(left) != sources.is_file(right):
             say("--partial leaves out the parameters that the file does not have")
     return ExitCode.DONE if outcome.is_same else ExitCode.INCOMPLETE
 

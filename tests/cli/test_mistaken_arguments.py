@@ -133,7 +133,10 @@ def test_the_comparison_of_a_short_file_with_a_whole_table_mentions_partial(comm
     assert command("diff", "sim:px4", "few.parm", "--partial").code == 0
     assert command("save", "sim:px4", "whole.parm").code == 0
     assert "--partial" not in command("diff", "whole.parm", "quad.parm").err
-    assert "--partial" not in command("diff", "whole.parm", "sim:px4").err
+    whole = Path("whole.parm").read_text(encoding="utf-8")
+    Path("whole.parm").write_text(whole.replace("MC_ROLL_P 4.0", "MC_ROLL_P 5.0"), encoding="utf-8")
+    assert "1 different\n" in (compared := command("diff", "whole.parm", "sim:px4")).err
+    assert "--partial" not in compared.err
 
 
 def test_an_excerpt_of_a_wrong_file_has_no_escapes(command: Command) -> None:
