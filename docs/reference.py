@@ -62,9 +62,9 @@ def command_part() -> str:
             shared[names].append((option, text))
     sections = []
     for name, app in apps:
-        usage = app.usage or f"Usage: paramclient {name} [OPTIONS] {' '.join(_required(app))}".rstrip()
         rows = [each for each in options[name].items() if each not in shared[users[each]]]
-        section = [f"### {name}", f"`{usage.removeprefix('Usage: ')}`", *_paragraphs(app)]
+        usage = (app.usage or "").removeprefix("Usage: ")
+        section = [f"### {name}", f"`{usage}`", *_paragraphs(app)]
         sections += [*section, *([_list(rows)] if rows else [])]
     sections.append("## Options of several subcommands")
     for names, rows in sorted(shared.items(), key=lambda group: -len(group[0])):
@@ -87,11 +87,6 @@ def _options(app: App) -> Iterator[tuple[str, str]]:
             among = f" One of {', '.join(choices)}." if choices else ""
             text = " ".join((each.parameter.help or "").split()) + among
             yield ", ".join(f"`{name}`" for name in names), text
-
-
-def _required(app: App) -> list[str]:
-    arguments = app.assemble_argument_collection(parse_docstring=True)
-    return [each.names[0] for each in arguments if each.show and not each.names[0].startswith("-")]
 
 
 def _paragraphs(app: App) -> list[str]:

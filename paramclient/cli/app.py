@@ -154,7 +154,7 @@ _metadata: Final = App(
 )
 
 
-def _add(group: App, function: str, arguments: str | None = None, *examples: str) -> None:
+def _add(group: App, function: str, arguments: str = "", *examples: str) -> None:
     """Add a subcommand, named like its function without the group and a trailing underscore.
 
     The function is named and not imported: a subcommand loads only its own modules, which halves the time
@@ -163,7 +163,7 @@ def _add(group: App, function: str, arguments: str | None = None, *examples: str
     Args:
         group: the group, or the whole command line.
         function: module of `paramclient.cli`, and function.
-        arguments: the arguments in the usage line, if they are not the function's names.
+        arguments: the arguments in the usage line.
         examples: arguments of the examples in the help.
     """
     name = function.partition(":")[2].removesuffix("_").removeprefix(f"{group.name[0]}_")
@@ -171,7 +171,7 @@ def _add(group: App, function: str, arguments: str | None = None, *examples: str
     group.command(
         f"paramclient.cli.{function}",
         name=name,
-        usage=None if arguments is None else f"Usage: paramclient {words} [OPTIONS] {arguments}",
+        usage=f"Usage: paramclient {words} [OPTIONS] {arguments}".rstrip(),
         help_epilogue=_examples(*(f"{words} {each}".rstrip() for each in examples)) if examples else "",
     )
 
@@ -181,27 +181,27 @@ _add(_app, "read_commands:get", "URL NAME [NAME...]", "udpin:0.0.0.0:14550 MC_RO
 _add(_app, "set_command:set_", "URL NAME VALUE [NAME VALUE...]", "sim:px4 MC_ROLL_P 6.5 MC_PITCH_P 6.5")
 _add(_app, "apply:reset", "URL NAME [NAME...]|--all", "sim:ardupilot 'RTL_*' --dry-run")
 _add(_app, "read_commands:watch", "URL [NAME...]", "udpin:0.0.0.0:14550 MC_ROLL_P --json")
-_add(_app, "link:link", None, "udpin:0.0.0.0:14550 --seconds 10 --json")
-_add(_app, "check:check", None, "udpin:0.0.0.0:14550")
+_add(_app, "link:link", "URL", "udpin:0.0.0.0:14550 --seconds 10 --json")
+_add(_app, "check:check", "URL", "udpin:0.0.0.0:14550")
 _add(_app, "show:show", "[FILE|VEHICLE [NAME...]]", "", "1 MC_ROLL_P", "quad.params")
 _add(_app, "sources:diff", "LEFT RIGHT", "quad.param tcp:127.0.0.1:5760 --only 'MC_*'", "1 2 --base defaults")
 _add(_app, "cached:history", "VEHICLE [NAME...]", "1 'MC_*' --since '2h ago'", "1 --snapshots")
 _add(_app, "show:search", "WORD [WORD...]", "roll rate", "geofence --metadata apm.pdef.xml")
-_add(_app, "show:info", None, "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
+_add(_app, "show:info", "NAME", "MC_ROLL_P", "rtl_alt --vehicle 1 --json")
 _add(_app, "sources:save", "URL|LOG|VEHICLE FILE", "udpin:0.0.0.0:14550 quad.params", "1 own.param --changed")
 _add(_app, "apply:apply", "URL FILE", "sim:px4 quad.params --dry-run", "sim:px4 {system}.param --vehicle all")
 _add(_app, "apply:restore", "URL [WHEN|FILE]", "sim:px4 --dry-run", "udpin:0.0.0.0:14550 '2h ago'")
 _add(_app, "cached:import_", "FILE [FILE...]", "flight.tlog")
 _add(_app, "serve:serve", "LINK [LINK...]", "serial:/dev/ttyACM0:57600 --listen 127.0.0.1:0")
-_add(_app, "serve:token", None, "anna --file tokens", "wall-display --file tokens --read")
+_add(_app, "serve:token", "NAME --file FILE", "anna --file tokens", "wall-display --file tokens --read")
 _add(_app, "link:ports")
-_add(_app, "serve:sim", None, "px4 --link udpout:127.0.0.1:14550", "'ardupilot?loss=0.05&seed=1'")
+_add(_app, "serve:sim", "VEHICLE", "px4 --link udpout:127.0.0.1:14550", "'ardupilot?loss=0.05&seed=1'")
 for _each in (_cache, _metadata, _signing):
     _app.command(_each)
-_add(_signing, "signing:setup", None, "udpin:0.0.0.0:14550 --signing-key vehicle.key")
-_add(_signing, "signing:disable", None, "udpin:0.0.0.0:14550 --signing-key vehicle.key")
-_add(_metadata, "metadata:metadata_add", None, "apm.pdef.xml --firmware 4.6")
+_add(_signing, "signing:setup", "URL", "udpin:0.0.0.0:14550 --signing-key vehicle.key")
+_add(_signing, "signing:disable", "URL", "udpin:0.0.0.0:14550 --signing-key vehicle.key")
+_add(_metadata, "metadata:metadata_add", "FILE", "apm.pdef.xml --firmware 4.6")
 _add(_metadata, "metadata:metadata_list")
-_add(_metadata, "metadata:metadata_remove", None, "copter --firmware 4.6")
+_add(_metadata, "metadata:metadata_remove", "VEHICLE", "copter --firmware 4.6")
 _add(_cache, "cached:cache_list")
-_add(_cache, "cached:cache_remove", None, "1")
+_add(_cache, "cached:cache_remove", "VEHICLE", "1")

@@ -50,6 +50,7 @@ NO_VALUE = "set takes pairs of NAME and VALUE, or NAME=VALUE"
         ("save sim:px4 new.param --format exe", 'Invalid value "exe" for --format. Choose from: "qgc"'),
         ("save 1 new.param --no-cache", "'1' is a vehicle in the cache, which --no-cache excludes"),
         ("fect sim:px4", 'Unknown command "fect". Did you mean "fetch"?'),
+        ("token anna", 'Command "token" parameter --file requires an argument. Usage: paramclient token'),
         ("metadata add -", "-: cannot be read: No such file"),
         ("history", 'Command "history" parameter VEHICLE requires an argument.'),
         ("get MC_ROLL_P", 'Command "get" parameter NAME requires an argument. Usage: paramclient get'),
