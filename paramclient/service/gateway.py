@@ -171,8 +171,7 @@ class Gateway:
         present = [table for table in served if not table.is_lost]
         autopilots = [table for table in present if table.source[1] == messages.AUTOPILOT_COMPONENT]
         one = (autopilots or present)[:1]  # that answers a request which all components receive
-        may_write = station.may_sign or not any(link.client.signing_report() for link in found.values())
-        asker = Asker(station, *source, may_write)
+        asker = Asker(station, *source)
         match message:
             case messages.ParamRequestList() | messages.ParamExtRequestList():
                 for table in present:
@@ -224,7 +223,7 @@ class VehicleLink(Tap):
         client: as given.
         send: sends a frame of a station to the vehicles.
         systems: the system ids that were heard.
-        signing: the components that sign.
+        signing: the components that sign, and all where the gateway does: it signs for no unsigned station.
         file: returns the parameter file of a table.
     """
 
@@ -261,7 +260,7 @@ class VehicleLink(Tap):
             source = (seen.frame.system, seen.frame.component)
             if source != self._station.own_address:
                 self.systems.add(source[0])
-                if seen.is_signed:
+                if seen.is_signed or self._station.verifier is not None:
                     self.signing.add(source)
                 node = self._station.nodes.get(source)
                 if seen.frame.message_id == HEARTBEAT and node is not None:

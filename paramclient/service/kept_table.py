@@ -81,13 +81,11 @@ class Asker(NamedTuple):
     Attributes:
         station: to which the answer goes.
         system, component: its ids.
-        may_write: whether its sets are carried out.
     """
 
     station: GroundStation
     system: int
     component: int
-    may_write: bool
 
 
 class Pending(dict[Key, set[Asker]]):
@@ -414,8 +412,6 @@ class KeptTable(Stream[Change]):
         key = newest if newest[:3] == wanted else (*wanted, newest[3] + 1)
         if asker.station.endpoint.is_readonly:
             self._reject([asker], key, ParamErrorCode.READ_ONLY)
-        elif not asker.may_write:
-            self._reject([asker], key, ParamErrorCode.PERMISSION_DENIED)
         elif self._sets.begins(key, asker):
             self.component.core.spawn(self._set, key, asker)
 
@@ -479,7 +475,7 @@ class KeptTable(Stream[Change]):
     def _refuse(self, askers: Iterable[Asker], which: Which, code: int) -> None:
         """Send a PARAM_ERROR to each asker, with its ids: others would take it for their own requests."""
         name, index = (which, -1) if isinstance(which, str) else ("", which)
-        for station, system, component, _ in askers:
+        for station, system, component in askers:
             if not (self.session.dialect.has_ack or self.is_lost):
                 station.say(messages.ParamError(system, component, name, index, code), self.source)
 

@@ -116,11 +116,8 @@ class Partner:
 
     def of(self, kind: type[T], *, system: int | None = None) -> list[T]:
         """The received messages of a kind."""
-        found = [
-            decode(each)
-            for each in self.frames
-            if each.message_id in DECODED_IDS and system in (None, each.system)
-        ]
+        chosen = [each for each in self.frames if system in (None, each.system)]
+        found = (decode(each) for each in chosen if each.message_id in DECODED_IDS)
         return [each for each in found if isinstance(each, kind)]
 
     def clear(self) -> None:

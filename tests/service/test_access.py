@@ -252,12 +252,10 @@ async def test_no_broken_body_is_taken_or_breaks_the_service() -> None:
 
 
 async def test_odd_addresses_and_queries_are_problems() -> None:
+    ids = ("0/1", "256/1", "one/1", "1/-1", f"{'9' * 5_000}/1")
     async with browsing(generic()) as browser:
         for address in (
-            *(
-                f"/api/vehicles/{each}/params"
-                for each in ("0/1", "256/1", "one/1", "1/-1", f"{'9' * 5_000}/1")
-            ),
+            *(f"/api/vehicles/{each}/params" for each in ids),
             *(f"{V}/params?at={each}" for each in ("0", "9" * 5_000, "2026-11-20T14:00", "yesterday")),
             *(f"{V}/params?link={'x' * 201}", f"{V}/params?ext=perhaps", f"{V}/file?format=exe"),
             *(f"{V}/history?{each}" for each in ("limit=0", f"name={'N' * 17}", "since=yesterday")),

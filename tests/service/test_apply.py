@@ -16,20 +16,18 @@ from tests.commands import behind, in_process, leaping
 from tests.service.hub import V, browsing, problem, service, until
 from tests.shell import VALUES, Tap, generic, in_simulated_time, small_px4
 
-FORMATS = ["qgc", "parm", "mission-planner", "pck", "json"]
-
 
 @pytest.fixture
 def cache(tmp_path: Path) -> str:
     return str(tmp_path / "cache.sqlite3")
 
 
-@pytest.mark.parametrize("file_format", FORMATS)
-async def test_a_table_is_saved_in_every_format_and_read_again(file_format: str) -> None:
+@pytest.mark.parametrize("file_format", list(FileFormat))
+async def test_a_table_is_saved_in_every_format_and_read_again(file_format: FileFormat) -> None:
     async with browsing(generic()) as browser:
-        answer = await browser.get(f"{V}/file", params={"format": file_format})
+        answer = await browser.get(f"{V}/file", params={"format": file_format.value})
         assert answer.headers["content-disposition"].startswith('attachment; filename="generic-1-1-')
-        (found,) = loads(answer.content, file_format=FileFormat(file_format)).sets
+        (found,) = loads(answer.content, file_format=file_format).sets
         assert {name: each.value for name, each in found.items()} == VALUES
         body = {"name": "", "base64": base64.b64encode(answer.content).decode()}
         read = (await browser.post("/api/files", json=body)).json()
@@ -108,16 +106,13 @@ async def test_snapshots_are_stored_listed_read_and_applied(cache: str) -> None:
 
 
 async def test_history_has_changes_of_all_or_of_one_name(cache: str) -> None:
+    sets = [("PARAM_04", 9), ("PARAM_05", 8), ("PARAM_04", 7)]
     async with browsing(generic(), cache=cache) as browser:
-        for name, value in (("PARAM_04", 9), ("PARAM_05", 8), ("PARAM_04", 7)):
+        for name, value in sets:
             await browser.put(f"{V}/params/{name}", json={"value": value, "durable": True})
             await asyncio.sleep(1)
         lines = (await browser.get(f"{V}/history")).json()["history"]
-        assert [(each["name"], each["new"]) for each in lines] == [
-            ("PARAM_04", 9),
-            ("PARAM_05", 8),
-            ("PARAM_04", 7),
-        ]
+        assert [(each["name"], each["new"]) for each in lines] == sets
         of_one = (await browser.get(f"{V}/history?name=PARAM_04&limit=1")).json()["history"]
         assert [(each["old"], each["new"]) for each in of_one] == [(9, 7)]
         since = (await browser.get(f"{V}/history", params={"since": lines[1]["time"]})).json()["history"]

@@ -91,6 +91,7 @@ async def test_it_wants_a_token_of_its_file(tmp_path: Path) -> None:
 
 
 OTHERS = ["0.0.0.0:0", "[::]:0", "192.0.2.1:0", "station.example:0"]
+NOT_OURS = "tcpin:192.0.2.1:5760"
 INVALID = ["127.0.0.1", ":80", "::1:80", "[::1]", "host:", "host:x", "host:70000"]
 
 
@@ -103,11 +104,7 @@ INVALID = ["127.0.0.1", ":80", "::1:80", "[::1]", "host:", "host:x", "host:70000
         (2, ["sim:px4", "--cache", "a", "--no-cache"], "exclusive"),
         (2, ["sim:px4", "sim:px4"], "twice"),
         (2, [], "LINK"),
-        (
-            4,
-            ["sim:px4", "--listen", "127.0.0.1:0", "--mavlink", "tcpin:192.0.2.1:5760"],
-            "tcpin:192.0.2.1:5760",
-        ),
+        (4, ["sim:px4", "--listen", "127.0.0.1:0", "--mavlink", NOT_OURS], NOT_OURS),
     ],
 )
 def test_a_start_that_fails(
