@@ -352,7 +352,8 @@ async def set_params(author: Author, target: TargetArgument, body: WriteManyRequ
     result = await target.component.set_many(values, **options, author=author)
     results = [target.outcome(each) for each in result.outcomes]
     error = {} if result.error is None else {"error": str(result.error)}
-    return {"vehicle": json_output.vehicle_json(target.component), "results": results, **error}
+    ids = {"system": target.component.system, "component": target.component.component}
+    return {**ids, "vehicle": json_output.vehicle_json(target.component), "results": results, **error}
 
 
 @reading.post(f"{VEHICLE}/fetch")
