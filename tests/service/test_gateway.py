@@ -645,12 +645,17 @@ async def test_rule_6_queues_are_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
 
 async def test_rule_6_telemetry_holds_no_list_up() -> None:
     vehicle = Puppet(lambda message: ())
-    async with in_sync(Air([small_px4(), vehicle])) as (_, _, station):
+    async with in_sync(Air([small_px4(), vehicle])) as (served, _, station):
         await station.ask(GCS)
         frame = frames.build_frame(30, bytes(range(28)), system=1, component=1, sequence=1)
+        served.link.is_stuck = True
         for _ in range(2_000):
             vehicle.say_bytes(frame)
-        assert await listed(station, seconds=0.05) == 26
+        await anyio.sleep(2.0)
+        served.link.is_stuck = False
+        await station.ask(LIST, seconds=1.0)
+        ids = [each.message_id for each in station.frames]
+        assert ids.index(22) < 200 < ids.count(30)
 
 
 # 7: sequence numbers
@@ -998,8 +1003,12 @@ async def test_a_restart_during_a_list() -> None:
     async with in_sync(model) as (served, _, station):
         station.send(GCS, LIST)
         await anyio.sleep(0.01)
-        model.reboot(down=2.0)
+        served.link.is_stuck = True
+        model.reboot(down=8.0)
         await anyio.sleep(20.0)
+        served.link.is_stuck = False
+        await anyio.sleep(1.0)
+        assert 0 < len(station.of(ParamValue)) < 903
         component = await served.clients[0].component()
         assert component.sync_state == "synced"
         await station.ask(LIST)
