@@ -136,8 +136,8 @@ class GroundStation:
 
     @property
     def name(self) -> str:
-        """The endpoint's name, and its address there."""
-        return self.endpoint.name + ("" if self.peer is None else f"#{peer_in_words(self.peer)}")
+        """The endpoint's address, and its own one there."""
+        return self.endpoint.address + ("" if self.peer is None else f"#{peer_in_words(self.peer)}")
 
     @property
     def silence(self) -> float:
@@ -406,10 +406,12 @@ def parse_endpoint(text: str) -> MavlinkEndpoint:
     A listening link without an address listens on the loopback address.
 
     Raises:
-        UsageError: the name or an option is invalid.
+        UsageError: the name or an option is invalid, or no station can be there.
     """
     link, _, query = text.partition("?")
     kind, _, port = link.partition(":")
+    if kind in ("sim", "replay"):
+        raise UsageError(f"{link} is no endpoint: stations connect to udpin, udpout, tcpin, tcp or serial")
     if kind in ("udpin", "udp", "tcpin") and port.isdecimal():
         link = f"{kind}:127.0.0.1:{port}"
     options = dict(each.partition("=")[::2] for each in query.split("&") if each)

@@ -920,6 +920,8 @@ def test_rule_13_names_of_endpoints(tmp_path: Path) -> None:
     signed = parse_endpoint(f"udpout:127.0.0.1:14550?sign={key}")
     assert signed.name == "udpout:127.0.0.1:14550"
     assert signed.signer is not None
+    with pytest.raises(UsageError, match="no endpoint"):
+        parse_endpoint("sim:px4?readonly")
     for option in ("writeonly", "readonly=1", "sign"):
         with pytest.raises(UsageError, match=f"'{option}' is not an option"):
             parse_endpoint(f"tcpin:5760?{option}")
