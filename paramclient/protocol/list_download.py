@@ -24,8 +24,8 @@ from paramclient.wire.messages import HASH_CHECK, Message, ParamError
 LIST_REQUESTS_MAX: Final = 12
 """Requests for a list that does not begin: an ArduPilot ignores them early after its start."""
 LIST_REQUESTS_ALONE: Final = 3
-"""The first of them; reads of the index 0 and 1 take turns with the others, for firmware without a list. With
-firmware that was seen to answer these reads only, the first one is alone."""
+"""The first of them; reads of the index 1 or 0 take turns with the others, for firmware without a list. None
+is alone where reads by index were answered, and reads by name were not."""
 LIST_TIMEOUT_MIN: Final = 0.2
 """Seconds to wait for the first value of a list, at least: a second request makes the list begin again."""
 PAUSE_PX4: Final = 0.12
@@ -130,14 +130,16 @@ class _Download:
         """Request the list until its first value arrives; later a value too, where no list is served."""
         channel, dialect, target = self.channel, self.session.dialect, self.channel.reads_from
         self._began = anyio.current_time()
-        alone = 1 if self.session.reads_by_index else LIST_REQUESTS_ALONE
 
         def request(attempt: int) -> Message:
             self.session.report(0, self.table.count)
             self._begins_at = anyio.current_time() if attempt else -math.inf
-            if attempt < alone or attempt % 2 == 0:
+            if attempt < LIST_REQUESTS_ALONE or attempt % 2 == 0:
+                if self.session.reads_by_index:
+                    self._reading.add(1)
+                    self.channel.send(dialect.request_read(target, 1))
                 return dialect.request_list(target)
-            which = attempt // 2 % 2 ^ 1
+            which = int(attempt % 8 != 7)  # 1 is everywhere but where 0 is the only one
             self._reading.add(which)
             return dialect.request_read(target, which)
 

@@ -66,7 +66,7 @@ async def read(session: Session, which: str | int) -> ReportedValue:
 
 
 async def _read(session: Session, which: str | int, alias: str | int | None = None) -> ReportedValue:
-    """Read a parameter; of a component without such reads, the list may have it as the alias."""
+    """Read a parameter. Where that is not answered, a component may have it as the alias."""
     channel = session.channel
     began, must_wait = anyio.current_time(), channel.window.value == 0
     async with channel.window:
@@ -81,9 +81,12 @@ async def _read(session: Session, which: str | int, alias: str | int | None = No
                 except NoReply:
                     if which == HASH_CHECK or channel.is_lost:
                         raise
+                    if alias is not None:
+                        channel.send(session.dialect.request_read(channel.reads_from, alias))
                     control = await _control_read(session, which)
                     if control is None:
-                        if channel.is_lost or (listed := await _read_list(session, inbox, which)) is None:
+                        is_over = channel.is_lost or bool(alias and inbox)
+                        if is_over or (listed := await _read_list(session, inbox, which)) is None:
                             raise
                         return listed
                 if control.param_id in (which, alias):
@@ -133,8 +136,9 @@ async def _ask(
 
     wait, timing = queue_time(session), channel.timing
     is_certain, singles = bool(is_served) and not requests, 1 if requests else BACKOFF_FROM
-    may_be_off = which == HASH_CHECK and (session.table.hash is None or bool(session.table.unverified()))
-    is_first = is_served is None and (timing.round_trip is None) != may_be_off
+    is_known, has_time = timing.round_trip is not None, timing.timeout(0) * FIRST_ATTEMPTS > PATIENCE_MIN
+    may_be_off = is_known and (session.table.hash is None or bool(session.table.unverified()))
+    is_first = is_served is None and (may_be_off if which == HASH_CHECK else has_time or not is_known)
     if is_asked:
         answer: ReportedValue | None = await channel.wait_for(inbox, accept, anyio.current_time(), 0, wait)
         if answer is not None:

@@ -32,6 +32,8 @@ COMPONENTS_MAX: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each."""
 STREAM_PEERS_MAX: Final = 256
 """Peers of a stream with an unfinished frame."""
+_SIGNS: Final = (Heartbeat, messages.HighLatency2, messages.ParamValue, messages.ParamExtValue)
+"""Messages that show a new component."""
 _MAVLINK2_REQUESTS: Final = (messages.ParamExtRequestRead, messages.ParamExtRequestList, ParamExtSet)
 """Requests that exist in MAVLink 2 only: a component that has sent MAVLink 1 so far may understand them."""
 
@@ -262,11 +264,7 @@ class Station:
             self._take_foreign_set(message, frame, now)
             return
         if node is None:
-            is_sign = isinstance(
-                message,
-                Heartbeat | messages.HighLatency2 | messages.ParamValue | messages.ParamExtValue,
-            )
-            if not is_sign or len(self.nodes) >= COMPONENTS_MAX:
+            if not isinstance(message, _SIGNS) or len(self.nodes) >= COMPONENTS_MAX:
                 return
             node = self._add(address, peer, now)
         if peer != node.peer:
@@ -297,10 +295,8 @@ class Station:
     def _take_foreign_set(self, message: ParamSet | ParamExtSet, frame: Frame, now: float) -> None:
         author = f"station {frame.system}/{frame.component}"
         for node in self.nodes.values():
-            if message.target_system == node.system and message.target_component in (
-                node.component,
-                messages.COMP_ID_ALL,
-            ):
+            ids = (node.component, messages.COMP_ID_ALL)
+            if message.target_system == node.system and message.target_component in ids:
                 session = node.plain if isinstance(message, ParamSet) else node.extended
                 session.foreign_set(message.param_id, author, now)
 

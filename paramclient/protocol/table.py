@@ -195,7 +195,8 @@ class Table:
                 self.recount(count)
             return None
         count, before = min(count, PARAMETERS_MAX), self.count or 0
-        if index > count or (index == count and (0 in self.names or index == 0)):
+        is_beyond = index > count or (index == count and (0 in self.names or index == 0))
+        if is_beyond or (index == 0 and count == before and count in self.names):
             known = self.params.get(name)
             if index > before + BEYOND_MAX or (known is not None and known.index not in (None, index)):
                 return None  # some firmware answers reads by name with such an index
