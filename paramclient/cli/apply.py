@@ -40,9 +40,6 @@ _INCLUDABLE: Final = frozenset(CATEGORIES) - {READ_ONLY}
 """Categories of left-out parameters that --include writes; the vehicle lets no client write the others."""
 
 
-_OPTIONS: Final = ApplyFlags()
-
-
 @dataclass(frozen=True, slots=True)
 class State:
     """The values to write to one vehicle.
@@ -73,7 +70,7 @@ async def apply(
     *,
     partial: bool = False,
     metadata: MetadataChoice = None,
-    options: ApplyFlags = _OPTIONS,
+    options: ApplyFlags = ApplyFlags(),
 ) -> int:
     """Write the values of a parameter file to a vehicle, in dependency order, and verify each of them.
 
@@ -98,7 +95,7 @@ async def apply(
     return await _run(url, options, load, metadata)
 
 
-async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags = _OPTIONS) -> int:
+async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags = ApplyFlags()) -> int:
     """Restore an earlier state of a vehicle, with its own identity and calibration.
 
     Parameters that the state does not have are not changed. Identity and calibration are written if the state
@@ -130,7 +127,7 @@ async def reset(
     *names: str,
     all_: Annotated[bool, Parameter(name="--all")] = False,
     metadata: MetadataChoice = None,
-    options: ApplyFlags = _OPTIONS,
+    options: ApplyFlags = ApplyFlags(),
 ) -> int:
     """Set parameters to the firmware's defaults, in dependency order, and verify each of them.
 

@@ -44,10 +44,9 @@ class SigningTarget(KeyOptions):
     """Log each step on stderr, without the key."""
 
 
-_DEFAULTS: Final = SigningTarget()
-
-
-async def setup(url: str, /, *, present_key: Path | None = None, options: SigningTarget = _DEFAULTS) -> None:
+async def setup(
+    url: str, /, *, present_key: Path | None = None, options: SigningTarget = SigningTarget()
+) -> None:
     """Set the signing key of a vehicle, and verify that the vehicle signs with it.
 
     The key is taken from --signing-key or the environment. It is sent unencrypted: use a link that no other
@@ -65,7 +64,7 @@ async def setup(url: str, /, *, present_key: Path | None = None, options: Signin
     await _change(url, options, key, present, f"The key will be sent over {url} in clear text.")
 
 
-async def disable(url: str, /, *, options: SigningTarget = _DEFAULTS) -> None:
+async def disable(url: str, /, *, options: SigningTarget = SigningTarget()) -> None:
     """Remove the signing key of a vehicle, and verify that it neither signs nor requires signed frames.
 
     The current key (--signing-key or the environment) is needed if the vehicle requires signed frames: PX4

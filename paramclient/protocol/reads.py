@@ -109,7 +109,7 @@ async def _ask(
     awaited first. Where the round trip is long and silence would mean something, several copies are sent at
     once.
     """
-    channel, dialect = session.channel, session.dialect
+    channel, dialect, table = session.channel, session.dialect, session.table
     is_served = session.serves_reads.get(type(which))
 
     def accept(message: Message) -> ReportedValue | None:
@@ -137,7 +137,7 @@ async def _ask(
     wait, timing = queue_time(session), channel.timing
     is_certain, singles = bool(is_served) and not requests, 1 if requests else BACKOFF_FROM
     is_known, has_time = timing.round_trip is not None, timing.timeout(0) * FIRST_ATTEMPTS > PATIENCE_MIN
-    may_be_off = is_known and (session.table.hash is None or bool(session.table.unverified()))
+    may_be_off = which == HASH_CHECK and is_known and (table.hash is None or bool(table.unverified()))
     is_first = is_served is None and (may_be_off if which == HASH_CHECK else has_time or not is_known)
     if is_asked:
         answer: ReportedValue | None = await channel.wait_for(inbox, accept, anyio.current_time(), 0, wait)
