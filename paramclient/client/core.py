@@ -147,8 +147,7 @@ class ClientCore:
             self._error = error  # for the caller of `open` or `close`, and as the cause of ClientClosed
             if self._is_opened.is_set() and not self._is_to_close.is_set():
                 logger.error("%s: an unexpected error has ended the client", self.link.name, exc_info=error)
-            if self.station.gate.error is not None:
-                self.station.gate.error.__cause__ = error
+            self.link_task.closed.__cause__ = error
         finally:
             self._is_opened.set()
             self._is_closed.set()
@@ -185,8 +184,7 @@ class ClientCore:
                         self._work.cancel_scope.cancel()
                 finally:
                     self._work = None
-                    closed = ClientClosed("the client was closed", link=self.link.name)
-                    self.station.fail(closed, for_good=True)
+                    self.station.fail(self.link_task.closed, for_good=True)
                     self.link_task.notify()
                     self._ended()
                     io.cancel_scope.cancel()

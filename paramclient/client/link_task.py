@@ -56,6 +56,7 @@ class LinkTask:
         bytes_received, bytes_sent: on this link.
         accepts: whether to take received data of a peer; called with each chunk.
         cutter: cuts the received data for the taps.
+        closed: the error of calls that wait when the client is closed.
     """
 
     station: Station
@@ -66,6 +67,7 @@ class LinkTask:
         self.bytes_received = self.bytes_sent = 0
         self.cutter = FrameCutter(stream=link.is_stream)
         self.accepts: Callable[[bytes, Peer], bool] = lambda data, peer: True
+        self.closed = ClientClosed("the client was closed", link=link.name)
         self._link = link
         self.taps = list(taps)
         self._ended = ended
@@ -137,7 +139,7 @@ class LinkTask:
                 await self.flush()
                 await self._something_to_send.wait()
         finally:  # the event loop may cancel all tasks at once: no conversation waits for an answer then
-            self.station.fail(ClientClosed("the client was closed", link=self._link.name), for_good=True)
+            self.station.fail(self.closed, for_good=True)
 
     async def flush(self) -> None:
         """Send all queued frames."""
