@@ -99,7 +99,7 @@ class Identification:
         self.vehicles = 0
         self.former = self.identity
         self.chosen = chosen
-        self._listens_only = listens_only
+        self.listens_only = listens_only
         self._has_no_heartbeat = False
         self._changed = anyio.Event()
 
@@ -149,7 +149,7 @@ class Identification:
             return True
         if self.autopilot is None:  # an ArduPilot shows itself by its heartbeat alone
             return self.is_settled and (self.is_encoding_known or self._has_no_heartbeat)
-        return self.is_settled or self._listens_only
+        return self.is_settled or self.listens_only
 
     async def settled(self) -> None:
         """Wait until the identity is as complete as it gets."""

@@ -14,6 +14,7 @@ from paramclient.protocol.channel import WINDOW_PX4, Channel, Gate
 from paramclient.protocol.dialect import EXTENDED, PLAIN, Digest
 from paramclient.protocol.identity import HEARTBEAT_WAIT, Identification
 from paramclient.protocol.presence import SYSTEM_TIME, Presence
+from paramclient.protocol.reads import read_again
 from paramclient.protocol.session import Session, Shared, Spawn
 from paramclient.wire import messages
 from paramclient.wire.messages import CommandLong, Message
@@ -106,7 +107,8 @@ class Node:
             self._spawn(self._request_clock)
         match message:
             case messages.ParamValue():
-                self.plain.receive(message, now)
+                if (until := self.plain.receive(message, now)) is not None:
+                    self._spawn(read_again, self.plain, message.param_id, until)
                 if message.param_id == messages.HASH_CHECK:
                     self.plain.announce(Digest.of(message))
             case messages.ParamExtValue():

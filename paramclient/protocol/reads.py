@@ -189,6 +189,13 @@ async def read_many(session: Session, names: Iterable[str]) -> None:
             tasks.start_soon(read_one, name)
 
 
+async def read_again(session: Session, name: str, at: float) -> None:
+    """Read a parameter at a time; it may fail."""
+    await anyio.sleep_until(at)
+    with suppress(ParamClientError):
+        await read(session, name)
+
+
 def refusal(session: Session, which: str | int, code: int) -> UnknownParameter | TypeMismatch | Refused:
     """Return the error for a PARAM_ERROR with this code."""
     if code == ParamErrorCode.DOES_NOT_EXIST:

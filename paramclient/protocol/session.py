@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
@@ -11,7 +10,7 @@ from typing import Any, Final, Generic, TypeVar
 import anyio
 
 from paramclient.errors import AnotherVehicle, NoReply
-from paramclient.model.values import Encoding, Param, ParamType
+from paramclient.model.values import Encoding, Param, ParamType, as_reported
 from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
 from paramclient.protocol.identity import Identification
@@ -27,6 +26,11 @@ FOREIGN_SET_MEMORY: Final = 2.0
 """Seconds for which a PARAM_SET of another station explains a change."""
 FOREIGN_SETS_MAX: Final = 256
 """PARAM_SETs of other stations that are remembered; the oldest is dropped first."""
+LATE_ANSWER_TIME: Final = 0.3
+"""Seconds after a change in which an ArduPilot may answer an earlier read: it takes the value when it queues
+the answer, and sends it up to 100 ms later."""
+REPLACED_MAX: Final = 16
+"""Values of one parameter that are remembered meanwhile: it acknowledges its sets every 6 ms at most."""
 
 
 class FileUnavailable(Exception):
@@ -114,12 +118,12 @@ class _Run(Generic[T]):
 
 @dataclass(slots=True)
 class ReplacedValue:
-    """The value before a write, while an answer to an earlier read may still bring it.
+    """The value before a change, while an answer to an earlier read may still bring it.
 
     Attributes:
-        param: the parameter before the write.
+        param: the parameter before the change.
         until: when such an answer can arrive no more.
-        was_received: whether the value was received meanwhile, and ignored.
+        was_received: whether the value was received meanwhile, and ignored: it may be the present one.
     """
 
     param: Param
@@ -141,12 +145,13 @@ class Session:
         fetching: the fetch that is in progress, shared by all callers.
         reading: names and indices whose reads are in progress.
         writing: the authors of the writes in progress, by name.
+        sent: by name, the bytes that they have sent.
         serves_file: whether the parameter file was served on this link; None while unknown.
         serves_checksum: likewise, whether its checksum is computed.
         ftp_unanswered: attempts of MAVFTP requests in vain, since the last file.
         announced: the last PX4 hash that was received, also in another station's list, or None.
         written_at: when the last write ended; minus infinity before the first.
-        replaced: by name, the values before writes that have just ended.
+        replaced: by name, the values of an ArduPilot before its last changes.
         contradicted: called when a hash is received that is not the table's.
         serves_reads: whether reads by name (str), and by index (int), are answered, as far as known.
         reads_by_index: whether reads by index were answered, and reads by name of the same were not.
@@ -173,12 +178,13 @@ class Session:
         self.fetching: Shared[Any] = Shared(spawn, channel.gate)
         self.reading: set[str | int] = set()
         self.writing: dict[str, str] = {}
+        self.sent: dict[str, bytes] = {}
         self.serves_file: bool | None = None
         self.serves_checksum: bool | None = None
         self.ftp_unanswered = 0
         self.announced: Digest | None = None
         self.written_at = -math.inf
-        self.replaced: defaultdict[str, list[ReplacedValue]] = defaultdict(list)
+        self.replaced: dict[str, list[ReplacedValue]] = {}
         self.contradicted: Callable[[], None] = lambda: None
         self.serves_reads: dict[type[str | int], bool] = {}
         self.reads_by_index = False
@@ -190,23 +196,32 @@ class Session:
         self._locks: dict[str, anyio.Lock] = {}
         self._foreign_sets: dict[str, tuple[str, float]] = {}
 
-    def receive(self, message: ReportedValue, now: float) -> None:
-        """Store a value, unless it may be the answer to a read from before a write."""
+    def receive(self, message: ReportedValue, now: float) -> float | None:
+        """Store a value, unless it may be the answer to a read from before a change.
+
+        Then, return the time at which only the parameter's present value can be received.
+        """
         name, spelled = message.param_id, self.spelled(message.param_id)
         is_listed = message.param_index != NO_INDEX and spelled not in self.table.params
         if name != spelled and self.identification.is_ardupilot and not is_listed:
             name, message = spelled, message._replace(param_id=spelled)
         _, raw, number, _, _ = message
-        for each in self.replaced.get(name, ()):
-            param = self.dialect.param(name, raw, number, None, self.table.encoding)
-            if now <= each.until and param.same_value(each.param):
+        known, encoding = self.table.params.get(name), self.table.encoding
+        is_sent, replaced = self.sent.get(name) == raw, self.replaced.get(name, [])
+        for each in replaced:
+            same = each.param.type == number and as_reported(each.param.bits, number, encoding) == raw
+            if same and now <= each.until and not is_sent:
                 each.was_received = True
-                return
-        if name in self.acknowledging and self.table.encoding is Encoding.BYTEWISE:
-            known = self.table.params.get(name)
-            if known is not None and known.type != number:
-                return
-        self.table.store(self.typed(message), now)
+                return each.until
+        if name in self.acknowledging and encoding is Encoding.BYTEWISE and known and known.type != number:
+            return None
+        self.table.store(self.typed(message), now, is_exact=is_sent)
+        is_read = self.identification.is_ardupilot and not self.identification.listens_only
+        if is_read and known and not known.same_value(self.table.params[name]):
+            kept = [each.param for each in replaced if each.was_received or now <= each.until]
+            until = now + LATE_ANSWER_TIME
+            self.replaced[name] = [ReplacedValue(each, until) for each in [*kept, known][-REPLACED_MAX:]]
+        return None
 
     def typed(self, message: ReportedValue) -> ReportedValue:
         """Return a value in the known type of its parameter, where it acknowledges an ArduPilot's default.

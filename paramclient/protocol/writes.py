@@ -31,7 +31,7 @@ from paramclient.model.names import is_group_switch
 from paramclient.model.values import Param, ParamType, Trust, Value, format_value
 from paramclient.protocol.channel import Inbox, task_group
 from paramclient.protocol.reads import queue_time, read, read_param, refusal
-from paramclient.protocol.session import ReplacedValue, Session
+from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
 from paramclient.wire.messages import Message, ParamError, ParamExtAck, StatusText
 
@@ -52,9 +52,6 @@ EXT_PROGRESS_READ: Final = 2.0
 EXT_TAKEN: Final = (ExtAckResult.ACCEPTED, ExtAckResult.IN_PROGRESS)
 BATCH_SIZE: Final = 20
 """Sets in flight: bursts of 20 to a PX4 and 30 to an ArduPilot were all acknowledged (measured)."""
-LATE_ANSWER_TIME: Final = 0.3
-"""Seconds after a write in which an ArduPilot may answer an earlier read: it takes the value when it queues
-the answer, and sends it up to 100 ms later."""
 UNWATCHED: Final = "It was not seen whether the vehicle changes the value later: it answers no more."
 DENIED: Final = "Param write denied ("
 """The beginning of ArduPilot's STATUSTEXT for a read-only parameter."""
@@ -115,16 +112,13 @@ async def write(
                 except (NoReply, LinkError, anyio.get_cancelled_exc_class()):
                     session.foreign_set(name, author, anyio.current_time())  # it may be acknowledged yet
                     raise
-            if session.identification.is_ardupilot and not result.param.same_value(before):
-                late = ReplacedValue(before, anyio.current_time() + LATE_ANSWER_TIME)
-                session.replaced[name].append(late)
-                session.spawn(_ignore_late_answers, session, late)
             if settle > 0:
                 report(result)
                 result = await _settled(session, vehicles, result, settle)
             return result
         finally:
             session.acknowledging.discard(name)
+            session.sent.pop(name, None)
             del session.writing[name]
             session.written_at = anyio.current_time()
 
@@ -255,8 +249,8 @@ class _Write:
     async def run(self) -> SetResult:
         """Send the set until its outcome is proven: by the wanted value, or by the same other one twice."""
         self._encode()
-        for each in list(self.session.replaced.get(self.name, ())):
-            if self._is_wanted(each.param):  # its acknowledgement would be ignored
+        for each in self.session.replaced.get(self.name, ()):
+            if self._is_wanted(each.param):  # a late answer would prove it
                 await anyio.sleep_until(each.until + 0.001)
         dialect = self.session.dialect
         keys = [(ParamExtAck, self.name)] if dialect.has_ack else [(dialect.value, self.name), StatusText]
@@ -343,6 +337,7 @@ class _Write:
         self.attempts += 1
         self._report(None)
         self.session.acknowledging.add(self.name)
+        self.session.sent[self.name] = self._raw
         dialect, number = self.session.dialect, self.before.type
         return dialect.request_set(self.channel.target, self.name, self._raw, number)
 
@@ -358,10 +353,7 @@ class _Write:
                 raise refusal(session, self.name, ParamErrorCode.READ_ONLY)
             return None
         assert isinstance(message, session.dialect.value)
-        _, raw, number, _, _ = message = session.typed(message)
-        if (number, raw) == (self.before.type, self._raw):
-            # this value, and not the rounded form of the one before
-            session.table.store(message, anyio.current_time(), is_exact=True)
+        _, raw, number, _, _ = session.typed(message)
         param = session.dialect.param(self.name, raw, number, None, encoding)
         if self._is_wanted(param) or number != self.before.type:
             return param
@@ -482,18 +474,6 @@ async def _seek_evidence(session: Session) -> None:
         for index in range(EVIDENCE_READS):
             channel.send(session.dialect.request_read(channel.reads_from, index))
         await channel.wait_for(inbox, lambda message: evidence or None, sent, 0, seconds)
-
-
-async def _ignore_late_answers(session: Session, late: ReplacedValue) -> None:
-    """Let the value before a write be ignored for its time; read the present one if it was received."""
-    name = late.param.name
-    await anyio.sleep_until(late.until)
-    session.replaced[name].remove(late)
-    if not session.replaced[name]:
-        del session.replaced[name]
-    if late.was_received:
-        with suppress(ParamClientError):
-            await read(session, name)
 
 
 def _check_finite(session: Session, name: str, value: Value, *, force: bool) -> None:

@@ -205,7 +205,15 @@ async def test_an_old_value_in_passing_proves_nothing_and_another_ones_is_no_adj
             assert vehicle.param("MC_ROLL_P").value == 3.5
 
 
-async def test_a_late_answer_with_an_old_value_undoes_no_acknowledged_write() -> None:
+async def test_a_set_of_another_station_right_behind_an_acknowledgement_is_the_later_change() -> None:
+    answers = [ParamValue("A", struct.pack("<i", each), ParamType.INT32, 1, 0) for each in (6, 7)]
+    vehicle = Partial(NUMBER, on_set=lambda message: answers)
+    async with talking(vehicle) as (conversation, session):
+        assert (await write(session, "A", 6)).status == "accepted"
+        assert [each.new and each.new.value for each in conversation.changes][-2:] == [6, 7]
+
+
+async def test_a_late_answer_with_an_old_value_undoes_no_change() -> None:
     """ArduPilot takes the value of a read when it queues it, and answers up to 100 ms later."""
     vehicle = ArduPilotVehicle(live_period=0.0)
     async with talking(Air.symmetric([vehicle], delay=0.005)) as (conversation, session):
@@ -216,8 +224,14 @@ async def test_a_late_answer_with_an_old_value_undoes_no_acknowledged_write() ->
                 await write(session, "ATC_ANG_RLL_P", 3.0 + step)
             await anyio.sleep(1.0)
             assert session.table.params["ATC_ANG_RLL_P"].value == 3.0 + step
+        for step in range(8):
+            async with meanwhile(read(session, "ATC_ANG_RLL_P")):
+                await anyio.sleep(0.013 * step)
+                vehicle.set_param("ATC_ANG_RLL_P", 20.0 + step)  # by another station
+            await anyio.sleep(1.0)
         changes = [each for each in conversation.changes if each.kind == "changed"]
-        assert [each.by for each in changes] == ["us"] * 8
+        assert [each.new and each.new.value for each in changes] == [*range(3, 11), *range(20, 28)]
+        assert [each.by for each in changes] == ["us"] * 8 + ["vehicle"] * 8
         # a write back is no late answer, and a change back by another station is found by a read
         await write(session, "ATC_ANG_RLL_P", 3.5)
         assert (await write(session, "ATC_ANG_RLL_P", 10.0)).status == "accepted"
