@@ -25,7 +25,7 @@ from paramclient.errors import FileErrorCode, FileTransferError, NoReply, Vehicl
 from paramclient.model.px4_hash import crc32_px4, crc32_px4_before
 from paramclient.model.values import Encoding, ParamType, Trust, as_reported, bits_of, bits_of_wire, from_bits
 from paramclient.protocol.channel import task_group
-from paramclient.protocol.ftp import BUSY, attempts_unproven, checksum, is_free
+from paramclient.protocol.ftp import BUSY, checksum, is_free
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode_entries, header
 from paramclient.protocol.reads import READS_PER_SLOT_ARDUPILOT, SLOT_ARDUPILOT, read
 from paramclient.protocol.session import FileUnavailable, Session
@@ -296,8 +296,7 @@ class _Proof:
     async def _request(self, numbers: Collection[int]) -> None:
         """Request the vehicle's checksums of the first rows, by their numbers."""
         session = self._session
-        is_proven = session.serves_checksum or session.serves_file
-        attempts = None if is_proven else attempts_unproven(session.channel)
+        attempts = session.ftp_attempts()
 
         async def request(number: int) -> None:
             asked_at = anyio.current_time()

@@ -9,8 +9,8 @@ import anyio
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError, VehicleError
 from paramclient.protocol.channel import task_group
-from paramclient.protocol.ftp import BUSY, FTP_SILENT_TIME, FileCutOff, attempts_unproven, is_free, read_file
-from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix
+from paramclient.protocol.ftp import BUSY, FTP_SILENT_TIME, FileCutOff, is_free, read_file
+from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix, encode
 from paramclient.protocol.reads import read
 from paramclient.protocol.session import FileUnavailable, Session
 
@@ -61,6 +61,9 @@ async def download_file(session: Session) -> int:
             reason = f"is not valid: {error}"
         else:
             reason = await _contradiction(session, pack, count)
+            expected = encode(pack.entries, with_defaults=pack.with_defaults)
+            if not reason and vehicle.is_ardupilot and expected != data:
+                reason = "is a mixture of two tables"
         if not reason:
             session.serves_file, session.ftp_unanswered = True, 0
             _store(session, pack, requested_at)
@@ -113,7 +116,7 @@ async def _read(session: Session, path: str, requested_at: float) -> tuple[bytes
         if size and total:
             session.report(min(received * total // size, total), total)
 
-    attempts = None if session.serves_file else attempts_unproven(channel)
+    attempts = session.ftp_attempts()
     async with task_group() as tasks:
         data = await read_file(
             channel, path, size_max=PACK_SIZE_MAX, open_attempts=attempts, progress=report, begun=begun

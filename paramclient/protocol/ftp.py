@@ -170,17 +170,6 @@ async def is_free(channel: Channel) -> bool:
     return False
 
 
-def attempts_unproven(channel: Channel) -> Callable[[], int]:
-    """Return the function for the attempts of a request that begins now, where MAVFTP was never answered."""
-    began = anyio.current_time()
-
-    def attempts() -> int:
-        is_late = anyio.current_time() - began + channel.timing.timeout(0) > FTP_SILENT_TIME
-        return 0 if is_late else channel.timing.attempts_for(SILENT_LOST)
-
-    return attempts
-
-
 async def checksum(channel: Channel, path: str, *, attempts: Callable[[], int] | None = None) -> int:
     """Return the CRC-32 of a file, computed by the component: PX4's, see `crc32_px4`. Opens no session.
 

@@ -13,6 +13,7 @@ from paramclient.errors import AnotherVehicle, NoReply
 from paramclient.model.values import Encoding, Param, ParamType, as_reported
 from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
+from paramclient.protocol.ftp import FTP_SILENT_TIME, SILENT_LOST
 from paramclient.protocol.identity import Identification
 from paramclient.protocol.table import Table
 from paramclient.wire.messages import NO_INDEX
@@ -269,6 +270,20 @@ class Session:
         if is_other or not identification.is_confirmed:
             waited = anyio.current_time() - began
             raise NoReply(f"the identity of {self.channel}", attempts=0, waited=waited)
+
+    def ftp_attempts(self) -> Callable[[], int] | None:
+        """Return the function for the attempts of a MAVFTP request that begins now; None where it was
+        answered."""
+        if self.serves_file or self.serves_checksum:
+            return None
+        began, timing = anyio.current_time(), self.channel.timing
+
+        def attempts() -> int:
+            is_late = anyio.current_time() - began + timing.timeout(0) > FTP_SILENT_TIME
+            is_vain = is_late or not self.identification.may_serve_file  # the version may just have arrived
+            return 0 if is_vain else timing.attempts_for(SILENT_LOST)
+
+        return attempts
 
     def lock(self, name: str) -> anyio.Lock:
         """Return the lock of the writes to one name: they run one after the other."""

@@ -194,6 +194,13 @@ async def test_silent_mavftp_is_learnt_on_a_lossy_link() -> None:
         assert len(conversation.sent_of(messages.FileTransfer)) == requests > 0
 
 
+async def test_a_vehicle_that_says_that_it_has_no_mavftp_is_listed_then() -> None:
+    air = Air.symmetric([ArduPilotVehicle(ftp=False)], delay=0.05)
+    async with talking(air) as (conversation, session):
+        assert (await fetch_all(session)).source == "stream"  # begins before its version is known
+        assert len(conversation.sent_of(messages.FileTransfer)) == 1
+
+
 @pytest.mark.parametrize("code", ParamErrorCode)
 async def test_a_hash_that_is_refused_for_any_reason_is_no_hash(code: ParamErrorCode) -> None:
     def up(message: messages.Message) -> bool:
