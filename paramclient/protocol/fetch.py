@@ -170,10 +170,9 @@ async def fetch_all(
                 lambda: _Fetch(session, policy).run(refresh=refresh)
             )
             if not refresh or result.source != "cache":  # else another caller began it
-                break
+                return result
     finally:
         session.observers.discard(observe)
-    return result
 
 
 class _Fetch:
