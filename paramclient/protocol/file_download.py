@@ -51,12 +51,12 @@ async def download_file(session: Session) -> int:
             if (is_missing and not session.serves_file) or error.code == FileErrorCode.UNKNOWN_COMMAND:
                 session.serves_file = False  # else another station has closed it
             raise FileUnavailable(f"the parameter file was refused: {error.reason}") from None
+        except FileCutOff as error:
+            _store_beginning(session, error.prefix, requested_at)
+            raise FileUnavailable("MAVFTP did not answer") from None
         except NoReply as error:
-            is_silent = not isinstance(error, FileCutOff)
-            if isinstance(error, FileCutOff):
-                _store_beginning(session, error.prefix, requested_at)
-            session.ftp_unanswered += error.attempts * is_silent
-            raise FileUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
+            session.ftp_unanswered += error.attempts
+            raise FileUnavailable("MAVFTP did not answer", is_silent=True) from None
         except PackError as error:
             reason = f"is not valid: {error}"
         else:

@@ -106,16 +106,9 @@ class Packet(NamedTuple):
 
     def pack(self) -> bytes:
         """Encode as the payload of a message; the message pads it."""
-        head = _HEADER.pack(
-            self.sequence & 0xFFFF,
-            self.session,
-            self.opcode,
-            self.size or len(self.data),
-            self.requested,
-            self.burst_complete,
-            self.offset,
-        )
-        return head + self.data
+        size = self.size or len(self.data)
+        numbers = (self.session, self.opcode, size, self.requested, self.burst_complete, self.offset)
+        return _HEADER.pack(self.sequence & 0xFFFF, *numbers) + self.data
 
     @property
     def code(self) -> int:
