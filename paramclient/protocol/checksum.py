@@ -157,8 +157,8 @@ class _Proof:
         often = {at for at, row in enumerate(rows) if row.name in volatile} - always - seconds
         rare = {at for at, row in enumerate(rows) if row.name == BOOT_COUNT or may_be_rounded(row)}
         suspects: set[int] = set()
-        numbers = {len(whole)} | self._ends_of(always, whole)
-        await self._request(numbers | {1} if self._is_slow else numbers)  # 1: its header has the count
+        numbers = {len(whole)} | (self._ends_of(always, whole) or ({1} if self._is_slow else set()))
+        await self._request(numbers)  # the first rows show whether the count in the header is another
         while places := self._places():
             if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
                 suspects = {at for at in whole if MEASURED.fullmatch(rows[at].name) and rows[at].bits}
