@@ -10,6 +10,7 @@ import math
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass
 from typing import Final, TypeAlias, TypeVar
 
 import anyio
@@ -272,12 +273,13 @@ def keys_of(message: Message) -> tuple[Key, ...]:
             return (type(message),)
 
 
+@dataclass(eq=False, repr=False)
 class Channel:
     """One component's side of the link.
 
     Args:
         system, component: the component's address.
-        transmit: queues a message for the component.
+        send: queues a message for the component.
         gate: whether the link carries messages.
         presence: when the component was heard.
 
@@ -294,25 +296,19 @@ class Channel:
         inboxes: those of the conversations that wait, by key.
     """
 
-    def __init__(
-        self,
-        system: int,
-        component: int,
-        transmit: Callable[[Message], None],
-        gate: Gate,
-        presence: Presence,
-    ) -> None:
-        self.system = system
-        self.component = component
-        self.target = self.reads_from = (system, component)
+    system: int
+    component: int
+    send: Callable[[Message], None]
+    gate: Gate
+    presence: Presence
+
+    def __post_init__(self) -> None:
+        self.target = self.reads_from = (self.system, self.component)
         self.timing = Timing()
-        self.gate = gate
         self.is_streaming = False
         self.ftp = anyio.Lock()
         self.answered = anyio.Event()
         self._ftp_sequence: int | None = None
-        self.send = transmit
-        self._presence = presence
         self.inboxes: dict[Key, list[Inbox]] = {}
         self._waits: dict[anyio.CancelScope, tuple[float, int, float] | None] = {}
         self.window = anyio.Semaphore(WINDOW)
@@ -362,15 +358,15 @@ class Channel:
     @property
     def is_lost(self) -> bool:
         """Whether the component sends heartbeats, and was silent for longer than these explain."""
-        return anyio.current_time() - self._presence.received_at >= self._presence.timeout
+        return anyio.current_time() - self.presence.received_at >= self.presence.timeout
 
     def is_silent(self, began: float) -> bool:
         """Return whether a conversation ends that began then: the component is silent for too long.
 
         One that begins in such a silence has as much time of its own.
         """
-        now, heard = anyio.current_time(), self._presence.received_at
-        silence_max = min(self._presence.timeout, SILENCE_MAX)
+        now, heard = anyio.current_time(), self.presence.received_at
+        silence_max = min(self.presence.timeout, SILENCE_MAX)
         since = heard if began - heard < silence_max else began
         return now - since >= silence_max
 

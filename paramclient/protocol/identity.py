@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import anyio
@@ -63,12 +63,12 @@ def judge_encoding(
     return Encoding.BYTEWISE, "the standard's encoding, as nothing says otherwise"
 
 
+@dataclass(eq=False, repr=False)
 class Identification:
     """What a component has said of itself.
 
     Args:
-        system: system id.
-        link: the link's name.
+        identity: system id and link.
         chosen: the encoding that the user has chosen, or None.
         listens_only: whether nothing is requested, so that the heartbeat decides.
 
@@ -86,20 +86,19 @@ class Identification:
         former: the vehicle before; without a hardware id if that was not known.
     """
 
-    def __init__(
-        self, system: int, link: str, chosen: Encoding | None, *, listens_only: bool = False
-    ) -> None:
-        self.identity = Identity(system, link)
-        self.autopilot: int | None = None
-        self.vehicle_type: int | None = None
-        self.capabilities: int | None = None
-        self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
-        self.is_settled = False
-        self.is_confirmed = True
-        self.vehicles = 0
+    identity: Identity
+    chosen: Encoding | None
+    listens_only: bool = False
+    autopilot: int | None = None
+    vehicle_type: int | None = None
+    capabilities: int | None = None
+    is_settled: bool = False
+    is_confirmed: bool = True
+    vehicles: int = 0
+
+    def __post_init__(self) -> None:
+        self.encoding, self.encoding_reason = judge_encoding(self.chosen, None, None)
         self.former = self.identity
-        self.chosen = chosen
-        self.listens_only = listens_only
         self._has_no_heartbeat = False
         self._changed = anyio.Event()
 

@@ -7,7 +7,7 @@ from typing import Final
 
 import anyio
 
-from paramclient.model.identity import hardware_id
+from paramclient.model.identity import Identity, hardware_id
 from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress
 from paramclient.protocol.channel import WINDOW_PX4, Channel, Gate
@@ -76,15 +76,15 @@ class Node:
         spawn: Spawn,
     ) -> None:
         self.address = address
-        self.system, self.component = system, component = address
+        self.system, self.component = address
         self.peer = peer
         self.since = since
         self.is_split = isinstance(address, PeerAddress)
         self.rival: tuple[Peer, float] | None = None
         self.told_rival: Peer | None = None
         self.presence = Presence()
-        self.channel = Channel(system, component, transmit, gate, self.presence)
-        self.identification = Identification(system, link, encoding, listens_only=listens_only)
+        self.channel = Channel(*address, transmit, gate, self.presence)
+        self.identification = Identification(Identity(self.system, link), encoding, listens_only)
         self.plain = Session(self.channel, self.identification, PLAIN, spawn, self.identified)
         self.extended = Session(self.channel, self.identification, EXTENDED, spawn, self.identified)
         self.sessions = (self.plain, self.extended)

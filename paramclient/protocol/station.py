@@ -6,6 +6,7 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 import anyio
@@ -40,6 +41,7 @@ _MAVLINK2_REQUESTS: Final = (messages.ParamExtRequestRead, messages.ParamExtRequ
 logger = logging.getLogger(__name__)
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class Station:
     """Turns received bytes into messages of components, and their requests into bytes to send.
 
@@ -52,7 +54,7 @@ class Station:
         is_stream: whether frames may be spread over several chunks.
         send: queues bytes for a peer; None for all.
         spawn: starts an async function in the background.
-        system, component: our address.
+        own_address: our system and component ids.
         encoding: of all components, by the user's choice; None: by the evidence.
         listens_only: whether nothing is ever sent.
         split_peers: whether equal ids at different peers are different components.
@@ -64,38 +66,26 @@ class Station:
         listening_since: since when everything on the link is received.
         verifier: verifies signatures; None without a key.
         broadcaster: the last heartbeat with the system id 0, which no vehicle may have; None without one.
-        own_address, own_type: our system and component ids, and the MAV_TYPE of our heartbeat.
+        own_type: MAV_TYPE of our heartbeat.
     """
 
-    def __init__(
-        self,
-        *,
-        link: str,
-        is_stream: bool,
-        send: Callable[[bytes, Peer | None], None],
-        spawn: Spawn,
-        system: int = 255,
-        component: int = 190,
-        encoding: Encoding | None = None,
-        listens_only: bool = False,
-        split_peers: bool = False,
-        discovered: Callable[[Node], None] = lambda node: None,
-    ) -> None:
-        self.link = link
+    link: str
+    is_stream: bool
+    send: Callable[[bytes, Peer | None], None]
+    spawn: Spawn
+    own_address: Address = (255, 190)
+    encoding: Encoding | None = None
+    listens_only: bool = False
+    split_peers: bool = False
+    discovered: Callable[[Node], None] = lambda node: None
+
+    def __post_init__(self) -> None:
         self.nodes: dict[Address, Node] = {}
         self.gate = Gate()
-        self.own_address = (system, component)
         self.own_type = messages.MAV_TYPE_GCS
-        self.listens_only = listens_only
         self.listening_since = -math.inf
         self.verifier: Verifier | None = None
         self.broadcaster: Heartbeat | None = None
-        self._is_stream = is_stream
-        self._send = send
-        self._spawn = spawn
-        self._encoding = encoding
-        self._splits_peers = split_peers
-        self._discovered = discovered
         self._datagrams = self._new_framer(stream=False)
         self._framers: dict[Peer, Framer] = {}
         self._ended_peers: set[Peer] = set()  # of components: another connection may take their ids
@@ -134,7 +124,7 @@ class Station:
 
     def receive(self, data: bytes, peer: Peer, now: float) -> None:
         """Take a datagram, or a chunk of a stream; an empty chunk means the end of the peer's stream."""
-        framer = self._framer_of(peer) if self._is_stream else self._datagrams
+        framer = self._framer_of(peer) if self.is_stream else self._datagrams
         for frame in framer.receive(data):
             self._take(frame, peer, now)
         if not data:
@@ -194,7 +184,7 @@ class Station:
         self._sequence = (self._sequence + 1) & 0xFF
         if self._signer is not None:
             data = sign_frame(data, self._signer)
-        self._send(data, peer)
+        self.send(data, peer)
 
     async def send_heartbeats(self) -> None:
         """Send our heartbeat once a second."""
@@ -244,7 +234,7 @@ class Station:
 
     def _take(self, frame: Frame, peer: Peer, now: float) -> None:
         system, component = frame.system, frame.component
-        address = PeerAddress(system, component, peer) if self._splits_peers else (system, component)
+        address = PeerAddress(system, component, peer) if self.split_peers else (system, component)
         node = self.nodes.get(address)
         message = decode(frame)
         is_own = (system, component) == self.own_address and not self.listens_only
@@ -309,20 +299,20 @@ class Station:
 
         node = Node(
             address,
-            link=f"{self.link}#{peer_in_words(peer)}" if self._splits_peers else self.link,
+            link=f"{self.link}#{peer_in_words(peer)}" if self.split_peers else self.link,
             peer=peer,
             since=now,
             transmit=transmit,
             gate=self.gate,
-            encoding=self._encoding,
+            encoding=self.encoding,
             listens_only=self.listens_only,
-            spawn=self._spawn,
+            spawn=self.spawn,
         )
         if self._asked.get((node.system, node.component), 0) > 2:
             node.channel.reads_from = (node.system, messages.COMP_ID_ALL)
         self.nodes[address] = node
-        self._discovered(node)
-        self._spawn(node.watch_presence)
+        self.discovered(node)
+        self.spawn(node.watch_presence)
         if not self.listens_only:
-            self._spawn(node.identify)
+            self.spawn(node.identify)
         return node

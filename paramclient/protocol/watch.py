@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
@@ -46,6 +47,7 @@ class SyncState(StrEnum):
     """The component is lost."""
 
 
+@dataclass(eq=False, repr=False)
 class Watch:
     """Keeps one table in sync, once it was fetched.
 
@@ -61,20 +63,13 @@ class Watch:
         confirmed_at: when the table was last known to be the vehicle's; minus infinity before.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        presence: Presence,
-        resynced: Callable[[tuple[str, ...]], None],
-        *,
-        interval: float | None = None,
-        policy: Policy = Policy.AUTO,
-    ) -> None:
-        self._session = session
-        self._presence = presence
-        self._resynced = resynced
-        self._interval = interval
-        self._policy = policy
+    session: Session
+    presence: Presence
+    resynced: Callable[[tuple[str, ...]], None]
+    interval: float | None = None
+    policy: Policy = Policy.AUTO
+
+    def __post_init__(self) -> None:
         self.confirmed_at = -math.inf
         self._is_fetched = False
         self._is_doubted = False
@@ -86,7 +81,7 @@ class Watch:
     @property
     def state(self) -> SyncState:
         """The present state."""
-        if self._presence.is_lost:
+        if self.presence.is_lost:
             return SyncState.LOST
         if not self._is_fetched:
             return SyncState.UNSYNCED
@@ -102,7 +97,7 @@ class Watch:
     def check(self, *, older_than: float) -> None:
         """Check soon whether the table is current, if the vehicle confirms tables and did not so recently."""
         is_old = anyio.current_time() - self.confirmed_at > older_than
-        if is_old and self._is_fetched and may_confirm(self._session):
+        if is_old and self._is_fetched and may_confirm(self.session):
             self._is_due = True
             self._signal.set()
 
@@ -121,12 +116,12 @@ class Watch:
 
     def doubt(self) -> None:
         """Check the table soon, where the policy allows it: there is a sign of change."""
-        if self._is_fetched and self._policy is not Policy.AUTO:
-            self._session.table.doubt()
+        if self._is_fetched and self.policy is not Policy.AUTO:
+            self.session.table.doubt()
             self._is_fetched = False
         elif self._is_fetched:
             if not self._is_doubted:
-                self._before = dict(self._session.table.params)
+                self._before = dict(self.session.table.params)
             self._is_doubted = self._is_due = True
             self._signal.set()
 
@@ -152,28 +147,28 @@ class Watch:
             try:
                 await self._check()
             except (NoReply, LinkError):
-                with self._session.channel.gate.until_closed():
+                with self.session.channel.gate.until_closed():
                     await anyio.sleep(RETRY_INTERVAL)
                 self._is_due = True
 
     @property
     def _wait(self) -> float:
         """Seconds until the next check without a sign of change."""
-        if self._interval is not None:
-            return self._interval or math.inf
-        return INTERVAL_DEFAULT if may_confirm(self._session) else math.inf
+        if self.interval is not None:
+            return self.interval or math.inf
+        return INTERVAL_DEFAULT if may_confirm(self.session) else math.inf
 
     @property
     def _may_check(self) -> bool:
-        is_allowed = self._policy is Policy.AUTO and self._is_fetched and not self._presence.is_lost
-        is_armed = bool((self._presence.base_mode or 0) & MAV_MODE_FLAG_SAFETY_ARMED)
-        session = self._session
+        is_allowed = self.policy is Policy.AUTO and self._is_fetched and not self.presence.is_lost
+        is_armed = bool((self.presence.base_mode or 0) & MAV_MODE_FLAG_SAFETY_ARMED)
+        session = self.session
         is_busy = session.fetching.is_running or session.channel.ftp.locked() or bool(session.writing)
         return is_allowed and not is_busy and not self._holds and (self._is_doubted or not is_armed)
 
     async def _check(self) -> None:
         """Ask whether the table is current, and fetch it where the vehicle does not say so."""
-        session, table = self._session, self._session.table
+        session, table = self.session, self.session.table
         was_doubted = self._is_doubted
         before = self._before if was_doubted else dict(table.params)
         answer = await ask(session)
@@ -192,4 +187,4 @@ class Watch:
         self.confirmed_at = anyio.current_time()
         changed = differing(before, table.params)
         if was_doubted or changed:
-            self._resynced(changed)
+            self.resynced(changed)

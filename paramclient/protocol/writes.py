@@ -6,7 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -216,6 +216,7 @@ async def write_many(
     return SetManyResult(*session.channel.target, tuple(outcomes), failures[0] if failures else None, elapsed)
 
 
+@dataclass(eq=False)
 class _Write:
     """One set, while it runs.
 
@@ -225,23 +226,19 @@ class _Write:
         attempts: sets that were sent.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        vehicles: int,
-        before: Param,
-        value: Value,
-        report: Callable[[SetResult | None], None],
-    ) -> None:
-        self.session = session
-        self.channel = session.channel
-        self.name = before.name
-        self.before = self.wanted = before
-        self.value = value
-        self.attempts = 0
+    session: Session
+    vehicles: int
+    before: Param
+    value: Value
+    report: Callable[[SetResult | None], None]
+    attempts: int = 0
+
+    def __post_init__(self) -> None:
+        self.channel = self.session.channel
+        self.name = self.before.name
+        self.wanted = self.before
         self._began = anyio.current_time()
-        self._confirm = partial(session.confirm, vehicles)
-        self._report = report
+        self._confirm = partial(self.session.confirm, self.vehicles)
         self._raw = b""
         self._has_other_value = False
         self._has_new_type = False
@@ -335,7 +332,7 @@ class _Write:
     def _request(self, attempt: int) -> Message:
         """Return the set, and count it as sent."""
         self.attempts += 1
-        self._report(None)
+        self.report(None)
         self.session.acknowledging.add(self.name)
         self.session.sent[self.name] = self._raw
         dialect, number = self.session.dialect, self.before.type
