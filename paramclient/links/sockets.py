@@ -51,6 +51,10 @@ PEERS_MAX: Final = 256
 """Addresses that a link remembers, one for each system id: broadcasts go to those. The limit bounds the
 memory for unknown senders; messages to a single vehicle do not depend on it."""
 
+FIRST_BYTES: Final = 600
+"""Bytes of a datagram that are searched for the first frame of a sender: two frames. The limit bounds the
+time for noise."""
+
 PEER_TIMEOUT: Final = 60.0
 """Seconds without data after which an address is forgotten."""
 
@@ -246,7 +250,7 @@ class UdpIn(SocketLink):
 
     def _learn(self, sender: Address, data: bytes) -> None:
         """Remember the sender if it is known or the data is a frame; forget the one silent for longest."""
-        if self._peers.pop(sender, None) is not None or self._framer.receive(data):
+        if self._peers.pop(sender, None) is not None or self._framer.receive(data[:FIRST_BYTES]):
             self._peers[sender] = anyio.current_time()
             if len(self._peers) > PEERS_MAX:
                 del self._peers[next(iter(self._peers))]
@@ -273,7 +277,6 @@ class UdpOut(UdpIn):
     broadcasts still go to the broadcast address.
     """
 
-    _is_group = False
     _remote: Address
 
     async def _open(self, opening: int) -> None:

@@ -70,21 +70,18 @@ class Rows(NamedTuple):
 
 def rows_of(session: Session) -> Rows | None:
     """Return the entries of the file of a complete table; None if the table does not have them exactly."""
-    table = session.table
-    entries, has_defaults = [], True
-    for _, name in sorted(table.names.items()):
-        param = table.params[name]
+    table, entries = session.table, []
+    params = [table.params[name] for _, name in sorted(table.names.items())]
+    for param in params:
         if param.is_raw or param.type not in PACKABLE:
             return None
         default = None
-        if param.default is None:
-            has_defaults = False
-        elif param.is_changed:
+        if param.default is not None and param.is_changed:
             default = bits_of(param.default, param.type)
-        entries.append(PackedParam(name, ParamType(param.type), param.bits, default))
+        entries.append(PackedParam(param.name, ParamType(param.type), param.bits, default))
     if table.hash is None and any(may_be_rounded(row) for row in entries):
         return None
-    return Rows(entries, has_defaults)
+    return Rows(entries, all(each.default is not None for each in params))
 
 
 def reply(

@@ -12,7 +12,7 @@ from base64 import b64decode
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from datetime import datetime
 from functools import partial
-from typing import Annotated, Any, ClassVar, Final, Self, TypeAlias
+from typing import Annotated, Any, ClassVar, Final, Self
 
 import anyio
 import anyio.to_thread
@@ -55,10 +55,6 @@ VALUES_MAX: Final = 10_000
 FILE: Final[dict[int | str, dict[str, Any]]] = {200: {"content": {"application/octet-stream": {}}}}
 """The response with a file, for the OpenAPI document."""
 _PAGE_NAME: Final = re.compile(r"[A-Za-z0-9._ -]{1,64}")
-
-Sample: TypeAlias = tuple[Mapping[str, object], float]
-"""Labels and a value."""
-
 
 # request bodies
 
@@ -528,8 +524,8 @@ async def metrics(hub: HubArgument) -> PlainTextResponse:
     return PlainTextResponse("\n".join([*lines, ""]))
 
 
-def _metrics(hub: Hub) -> Iterator[tuple[str, Sequence[Sample]]]:
-    """Yield name and samples of each metric. The name of a counter ends with `_total`."""
+def _metrics(hub: Hub) -> Iterator[tuple[str, Sequence[tuple[Mapping[str, object], float]]]]:
+    """Yield the name of each metric, with labels and values. The name of a counter ends with `_total`."""
     yield "info", [({"version": __version__}, 1)]
     yield "uptime_seconds", [({}, time.monotonic() - hub.started)]
     yield "events_total", [({}, hub.feed.seq)]

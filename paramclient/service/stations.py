@@ -20,7 +20,7 @@ from paramclient.links.sockets import TcpIn
 from paramclient.protocol.addresses import peer_in_words
 from paramclient.wire.frames import renumber_frame, sign_frame, unsign_frame
 from paramclient.wire.messages import Heartbeat, Message, encode, message_id
-from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
+from paramclient.wire.signing import Signer, SigningKey, SigningPolicy
 
 FRAMES_PER_DATAGRAM: Final = 37
 """Frames in one datagram, at most: as many PARAM_VALUEs as fit in `DATAGRAM_SIZE`."""
@@ -37,6 +37,9 @@ STATION_TIMEOUT: Final = 60.0
 """Seconds of silence after which a station on UDP is forgotten."""
 STATIONS_MAX: Final = 64
 """Stations of one endpoint, at most; the one that was silent for longest is forgotten first."""
+NOISE_MAX: Final = 4
+"""Datagrams without a frame, of one sender and in one read, after which its others are dropped: a flood of
+noise delays no other station."""
 REQUESTS_MAX: Final = 200
 """Requests of one station that wait for a vehicle or a fetch, at most; further ones are dropped, as on a full
 link."""
@@ -309,9 +312,10 @@ class MavlinkEndpoint:
         self.stations: dict[Peer | None, GroundStation] = {}
         self.sending: Callable[[bytes], None] = lambda data: None
         self.signer: Signer | None = None
-        self._verifier: Verifier | None = None
+        self._accepts: Callable[[bytes], bool] = lambda data: True
         if key is not None:
-            self.signer, self._verifier = Signing(key, SigningPolicy.SIGNED_ONLY, ANSWER_LINK_ID).begin()
+            self.signer, verifier = Signing(key, SigningPolicy.SIGNED_ONLY, ANSWER_LINK_ID).begin()
+            self._accepts = verifier.accepts
         self._listens = self.name.startswith(("udpin:", "tcpin:"))
 
     @property
@@ -361,10 +365,12 @@ class MavlinkEndpoint:
         """Receive frames until the link fails."""
         cutter = FrameCutter(stream=self.link.is_stream)
         while True:
+            noise: Counter[Peer] = Counter()  # chunks without a frame
             for peer, data in await self.link.receive():
-                frames = [each for each in cutter.cut(data, peer) if each.is_proven or not each.is_known]
-                if self._verifier is not None:
-                    frames = [each for each in frames if self._verifier.accepts(each.data)]
+                cut = cutter.cut(data, peer) if noise[peer] < NOISE_MAX else ()
+                sound = (each for each in cut if each.is_proven or not each.is_known)
+                frames = [each for each in sound if self._accepts(each.data)]
+                noise[peer] += not frames
                 for seen in frames:
                     station = self._station(peer if self._listens else None, tasks)
                     station.received(seen)

@@ -27,8 +27,8 @@ _new = tuple.__new__  # the constructor of a named tuple ends in this call and t
 _SETUP_SIGNING = (256).to_bytes(3, "little")
 _NO_KEY = b""  # of no message
 
-find_magic: Final = re.compile(b"[\xfd\xfe]").search
-"""Finds the next byte with which a frame can begin."""
+find_magic: Final = re.compile(rb"\xfd(?:.?\Z|.[\0\1])|\xfe", re.DOTALL).search
+"""Finds the next byte with which a frame can begin: MAVLink 2 defines one flag, for a signature."""
 
 
 class Frame(NamedTuple):
