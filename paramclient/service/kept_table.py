@@ -47,7 +47,8 @@ LOADING_WAIT: Final = 1.0
 READ_TIMEOUT: Final = 3.0
 """Seconds for a value or a name that the table does not have."""
 SET_TIMEOUT: Final = 2.9
-"""Seconds for a verified write: a station has a result within 3 s."""
+"""Seconds for a verified write: a station has a result within 3 s. During a fetch, the acknowledgement may
+wait behind the list in the radio's queue, and takes as long as it needs: an error would be wrong."""
 ASKED_AT_ONCE: Final = 4
 """Reads by stations that the vehicle is asked for at once."""
 TAKE_OVER_TIME: Final = 10.0
@@ -418,7 +419,7 @@ class KeptTable(Stream[Change]):
     async def _set(self, key: SetKey, first: Asker) -> None:
         code = int(NO_ANSWER)
         try:
-            with anyio.move_on_after(SET_TIMEOUT):
+            with anyio.move_on_after(math.inf if self.is_loading else SET_TIMEOUT):
                 async with first.station.writing:
                     code = await self._write(key, f"station {first.system}/{first.component}")
         except ParamClientError as error:
