@@ -31,8 +31,6 @@ def _check_seconds(_: object, seconds: float | None) -> None:
 
 Seconds: TypeAlias = Annotated[float | None, Parameter(validator=_check_seconds)]
 """A timeout in seconds."""
-Verbose: TypeAlias = Annotated[bool, Parameter(name=("--verbose", "-v"))]
-"""Whether each step is logged on stderr."""
 
 
 @Parameter(name="*")
@@ -53,7 +51,10 @@ class CacheOptions:
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
 class KeyOptions:
-    """The signing key and this computer's own id, of subcommands that open a link."""
+    """The signing key, this computer's own id and the log of steps, of subcommands that open a link."""
+
+    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
+    """Log each step on stderr, without the key."""
 
     signing_key: Annotated[Path | None, CONNECTION] = None
     """A file with the key. Default: that of the environment."""
@@ -83,9 +84,6 @@ class TrafficOptions(KeyOptions):
 
     json: bool = False
     """Print JSON."""
-
-    verbose: Verbose = False
-    """Log each step on stderr."""
 
     tlog: Annotated[Path | None, CONNECTION] = None
     """Record the link in this new telemetry log."""

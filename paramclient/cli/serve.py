@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import anyio
 
 from paramclient.cli.app import on_end_signal
-from paramclient.cli.options import CACHE, KeyOptions, Verbose
+from paramclient.cli.options import CACHE, KeyOptions
 from paramclient.cli.output import print_line, say
 from paramclient.client.signing import read_key, timestamp_now
 from paramclient.errors import UsageError
@@ -32,7 +32,6 @@ async def serve(
     no_cache: Annotated[bool, CACHE] = False,
     listen_only: bool = False,
     tokens: Path | None = None,
-    verbose: Verbose = False,
     options: KeyOptions = KeyOptions(),
 ) -> None:
     """Open links and the cache, and share them with ground stations, programs and browsers.
@@ -57,7 +56,6 @@ async def serve(
             request.
         tokens: A file with access tokens, made by `paramclient token`. Without it, only this computer can
             connect.
-        verbose: Log each step on stderr.
     """
     _check_extra()
     from paramclient import service  # only here: needs the extra

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 
 from paramclient.cli.json_output import taken
-from paramclient.cli.options import CONNECTION, KeyOptions, Seconds, Verbose
+from paramclient.cli.options import CONNECTION, KeyOptions, Seconds
 from paramclient.cli.output import print_result, require_consent
 from paramclient.cli.session import ChosenVehicle, Deadline, wait_for_vehicle
 from paramclient.client.client import ParamClient
@@ -39,9 +39,6 @@ class SigningTarget(KeyOptions):
 
     json: bool = False
     """Print JSON."""
-
-    verbose: Verbose = False
-    """Log each step on stderr, without the key."""
 
 
 async def setup(
