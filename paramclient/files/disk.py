@@ -6,6 +6,7 @@ import os
 import secrets
 import stat
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -60,11 +61,20 @@ def replace_file(source: str, data: bytes, new_mode: int | None = None) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(target)
-        except BaseException:
-            with suppress(OSError):
+        finally:
+            with suppress(OSError):  # it has become the target, unless an error ended this
                 temporary.unlink()
-            raise
         _sync_folder(target.parent)
+
+
+def check_folder(source: str) -> None:
+    """Check that a file can be created in the folder of a file, before work that takes long.
+
+    Raises:
+        FileError: as `replace_file` would raise.
+    """
+    with _named_errors(source, "written"):
+        tempfile.TemporaryFile(dir=Path(os.path.realpath(source)).parent).close()
 
 
 @contextmanager

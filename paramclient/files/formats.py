@@ -47,13 +47,9 @@ def format_of_name(name: str) -> FileFormat:
         FileError: the extension is unknown.
     """
     ending = PurePath(name).suffix.lower()
-    file_format = ENDINGS.get(ending)
-    if file_format is None:
-        raise FileError(
-            f"unknown file extension {ending!r}. Choose a format ({', '.join(FileFormat)}), or one of the "
-            f"extensions {', '.join(ENDINGS)}",
-            source=name,
-        )
+    if (file_format := ENDINGS.get(ending)) is None:
+        known = f"a format ({', '.join(FileFormat)}), or one of the extensions {', '.join(ENDINGS)}"
+        raise FileError(f"unknown file extension {ending!r}. Choose {known}", source=name)
     return file_format
 
 
