@@ -113,7 +113,11 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
             since then. With --vehicle all, a time, or a backup file with {uid} or {system} in its name.
     """
     if when is None or not (is_file(when) or is_pattern_name(when)):
-        moment = None if when is None else parse_moment(when, time.time())
+        try:
+            moment = None if when is None else parse_moment(when, time.time())
+        except errors.UsageError as error:
+            problem = f"no such file, nor the number of a snapshot (history VEHICLE --snapshots): {error}"
+            raise errors.UsageError(problem) from None
         return await _run(url, options, bind(_earlier_state, moment))
     if ChosenVehicle.parse(options.vehicle).is_all and not is_pattern_name(when):
         raise errors.UsageError("with --vehicle all, the backup file needs {uid} or {system} in its name")
@@ -410,14 +414,16 @@ class _Job:
         else:
             say(f"{session.receiver}: {words or 'nothing acknowledged'}; {self.state.to_continue}")
             return code
-        say(f"{session.receiver}: {words or 'nothing to set'}{end}")
-        if left_out := Counter(row.category for row in found.shown_rows if row.category in _INCLUDABLE):
-            counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
-            includes = " ".join(f"--include {category}" for category in left_out)
-            remarks.append(f"left out: {counts}; to write them: {includes}")
-        if late:
-            remarks.append(f"takes effect after a reboot: {listed(late)}")
-        for remark in filter(None, [made.unchecked_note, *remarks]):
+        if not session.options.json:
+            say(f"{session.receiver}: {words or 'nothing to set'}{end}")
+            if left_out := Counter(row.category for row in found.shown_rows if row.category in _INCLUDABLE):
+                counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
+                includes = " ".join(f"--include {category}" for category in left_out)
+                remarks.append(f"left out: {counts}; to write them: {includes}")
+            if late:
+                remarks.append(f"takes effect after a reboot: {listed(late)}")
+            remarks.insert(0, made.unchecked_note)
+        for remark in filter(None, remarks):
             say(f"{session.label}: {remark}")
         return code
 

@@ -92,9 +92,8 @@ async def check(
     if options.json:
         members = [{"severity": severity, "text": text} for severity, text in found.findings]
         versions = {"paramclient": __version__, "python": platform.python_version()}
-        print_json(
-            {**found.json, "findings": members, "versions": versions | {"system": platform.platform()}}
-        )
+        found.json |= {"findings": members, "versions": versions | {"system": platform.platform()}}
+        print_json(found.json)
         return found.code
     print_table(("what", "measured"), found.rows)
     print_line("" if found.findings else "\nNothing slow or unusual.")

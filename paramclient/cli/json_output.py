@@ -77,10 +77,11 @@ def info_json(info: ParamInfo) -> JsonObject:
     found: JsonObject = {each.name: getattr(info, each.name) for each in fields(info)[2:]}
     found["values"] = {format_value(value): name for value, name in info.values.items()}
     found["bits"] = {str(bit): name for bit, name in info.bits.items()}
-    for name, member in found.items():
-        if isinstance(member, float):
-            found[name] = value_json(member, ParamType.REAL64)
-    return {name: each for name, each in found.items() if each not in (None, "", {}) and each is not False}
+    return {
+        name: value_json(each, ParamType.REAL64) if isinstance(each, float) else each
+        for name, each in found.items()
+        if each not in (None, "", {}) and each is not False
+    }
 
 
 def param_json(param: Param, info: ParamInfo | None = None, *, whole: bool = False) -> JsonObject:

@@ -159,10 +159,8 @@ def _print(found: JsonObject) -> None:
     rates = f"{found['received_per_s']:,.0f} bytes/s received, {found['sent_per_s']:,.0f} sent"
     faults = f"{found['damaged']:,} with a wrong checksum, {found['unknown']:,} of unknown ids"
     lines += ["", f"{found['link']}, {found['seconds']:.1f} s: {rates}"]
-    lines.append(
-        f"{found['frames']:,} frames, {lost:,} lost, {faults}, {signed:,} signed; "
-        f"{found['other_bytes']:,} other bytes"
-    )
+    frames = f"{found['frames']:,} frames, {lost:,} lost, {faults}, {signed:,} signed"
+    lines.append(f"{frames}; {found['other_bytes']:,} other bytes")
     if signing := found["signing"]:
         accepted = [f", {count:,} accepted: {reason}" for reason, count in signing["unproven"].items()]
         refused = [f", {count:,} refused: {reason}" for reason, count in signing["refused"].items()]

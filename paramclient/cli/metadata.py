@@ -19,15 +19,8 @@ from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import Status, print_result, say, show
 from paramclient.cli.session import CommandSession, wait_for_firmware
 from paramclient.errors import UsageError
-from paramclient.metadata import (
-    AddedMetadata,
-    Metadata,
-    MetadataStore,
-    VehicleKind,
-    metadata_of,
-    read_metadata,
-)
-from paramclient.metadata.store import AddedFiles
+from paramclient.metadata import Metadata, MetadataStore, VehicleKind, metadata_of, read_metadata
+from paramclient.metadata.store import AddedFiles, AddedMetadata
 from paramclient.model.names import counted
 from paramclient.model.paramset import Default, DefaultSource, ParamSet, WrittenParam, default_of
 from paramclient.model.values import Param

@@ -23,7 +23,6 @@ import anyio.to_thread
 from paramclient import errors
 from paramclient.errors import ParamClientError
 from paramclient.model.names import first_of
-from paramclient.model.values import Param
 
 STDIN: Final = "./-"
 """What `-` among the arguments becomes, which cyclopts would take for an option: the standard input, or where
@@ -66,11 +65,6 @@ def local_time(at: float) -> str:
     """Return a unix time as ISO 8601 in the time zone of this computer, with milliseconds and the zone."""
     found = datetime.fromtimestamp(at).astimezone()
     return found.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-def by_index(params: Iterable[Param]) -> list[Param]:
-    """Return parameters in the vehicle's order; those without an index last, by name."""
-    return sorted(params, key=lambda param: (param.index is None, param.index or 0, param.name))
 
 
 def listed(words: Sequence[object]) -> str:

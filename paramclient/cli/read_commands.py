@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import anyio
 
 from paramclient.cli.json_output import JsonObject, fetch_json, info_of, param_json, param_value, taken
-from paramclient.cli.metadata import MetadataChoice, default_in, known_of_session, say_sources
+from paramclient.cli.metadata import MetadataChoice, default_in, defaults_in, known_of_session, say_sources
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     ExitCode,
-    by_index,
     cells_of,
     listed,
     local_time,
@@ -31,7 +30,7 @@ from paramclient.errors import ParamClientError, VehicleError
 from paramclient.links import ReplayLink
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import hash_text, rounded, time_text
-from paramclient.model.paramset import Default, ParamMap
+from paramclient.model.paramset import ParamMap
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.table import Change
@@ -55,28 +54,32 @@ async def fetch(
         changed: Print only values that differ from the firmware's defaults.
         metadata: A file with defaults; or vehicle, to download them from it.
     """
-    chosen = NameChoice(check_given(names) or ["*"])
+    chosen = check_given(names)
     async with sessions(url, options) as found:
 
         async def work(session: CommandSession) -> _Shown:
             result = await session.fetch(refresh=refresh)
-            params = by_index(each for name, each in result.params.items() if name not in result.cached)
+            params, errors = await get_chosen(session, chosen, is_fetched=True)
+            if not chosen:
+                params = [each for name, each in result.params.items() if name not in result.cached]
+            params.sort(key=lambda param: (param.index is None, param.index or 0, param.name))
             known = None
             if changed or options.json or metadata is not None:
                 known = await known_of_session(session, metadata)
-            defaults = {param.name: default_in(known, param) for param in params} if changed else {}
-            if changed and not any(defaults.values()):
-                from paramclient.provision.sources import NO_DEFAULTS  # only here: loads provision
-
-                raise VehicleError(NO_DEFAULTS, *session.component.address)
-            kept = chosen.choose({param.name for param in params}) if names else {*result.params}
             if changed:
-                given = {name: default.value for name, default in defaults.items() if default}
-                kept &= ParamMap(result.params).changed(given).keys()
-            params = [param for param in params if param.name in kept]
+                given = {each.name: default_in(known, each) for each in params}
+                if params and not any(given.values()):
+                    from paramclient.provision.sources import NO_DEFAULTS  # only here: loads provision
+
+                    raise VehicleError(NO_DEFAULTS, *session.component.address)
+                table = ParamMap({each.name: each for each in params})
+                differing = table.changed(defaults_in(known, table))
+                params = [each for each in params if each.name in differing]
+                if not options.json:
+                    say_sources(session.label, [given[each.name] for each in params])
             columns = ("name", "value", "type", "index", "trust", *(["default"] if changed else []))
-            item = fetch_json(session.component, result, params, known)
-            return _Shown(item, columns, partial(_report_fetch, session, result, [*map(defaults.get, kept)]))
+            item = fetch_json(session.component, result, params, known) | _errors_json(errors)
+            return _Shown(item, columns, partial(_report_fetch, session, result, errors.values()))
 
         done = await found.work(work)
     return found.show(done)
@@ -106,8 +109,7 @@ async def get(
             params, errors = await get_chosen(session, chosen)
             known = await known_of_session(session, metadata)
             read = {each.name: param_json(each, info_of(known, each.name), whole=True) for each in params}
-            failed = {name: str(error) for name, error in errors.items()}
-            item: JsonObject = {"params": read} | ({"errors": failed} if failed else {})
+            item = {"params": read} | _errors_json(errors)
             columns = ("name", "value", "type", "index", "meaning", "units")
             return _Shown(item, columns, partial(_report_get, session, errors.values()))
 
@@ -132,13 +134,17 @@ class _Shown:
         return cells_of(self.json["params"], *self.columns[1:])
 
 
-def _report_fetch(session: CommandSession, result: FetchResult, defaults: Sequence[Default | None]) -> int:
-    """Print notes, a summary, and what is missing; return the exit code."""
+def _errors_json(errors: Mapping[str, ParamClientError]) -> JsonObject:
+    """Return the errors by name, if there are any, as a member of JSON."""
+    return {"errors": {name: str(error) for name, error in errors.items()}} if errors else {}
+
+
+def _report_fetch(session: CommandSession, result: FetchResult, errors: Collection[ParamClientError]) -> int:
+    """Print notes, a summary, the errors of names, and what is missing; return the exit code."""
     client, label = session.client, session.label
     for note in result.notes:
         report(f"{session.prefix}{note}")
     if not session.options.json:
-        say_sources(label, defaults)
         of = f" of {result.count}" if result.missing else ""
         crc = "" if result.hash is None else f"; hash {hash_text(result.hash)}"
         lost = "" if result.source == "cache" else f"{result.lost} lost, {result.repeated} repeated, "
@@ -147,11 +153,12 @@ def _report_fetch(session: CommandSession, result: FetchResult, defaults: Sequen
         fetched = f"{result.received}{of} {noun_of(session.component)}s of {label} from {result.source}"
         traffic = f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent{link}"
         say(f"{fetched} in {result.elapsed:.2f} s, {lost}{trip}{traffic}{crc}")
+    code = report_all(errors, session.prefix)
     if not result.missing:
-        return ExitCode.DONE
+        return code
     missing = f"{counted(len(result.missing), 'parameter')}, index {listed(result.missing)}"
     report(f"incomplete: {label} did not send {missing}; run the command again to request them")
-    return ExitCode.INCOMPLETE
+    return max(code, ExitCode.INCOMPLETE)
 
 
 def _report_get(session: CommandSession, errors: Collection[ParamClientError]) -> int:

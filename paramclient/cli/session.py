@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Final, Protocol, TypeVar
 
@@ -14,7 +14,7 @@ import anyio
 from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import LinkOptions, TrafficOptions
 from paramclient.cli.output import ExitCode, Status, listed, print_json, print_table, report, report_all, say
-from paramclient.client.client import ParamClient
+from paramclient.client.client import VEHICLES_LISTENING_TIME, ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, NoReply, ParamClientError, UnknownParameter, UsageError
 from paramclient.links import LinkKind
@@ -300,6 +300,9 @@ async def sessions(
         LinkError: the link cannot be opened, or failed.
     """
     choice, deadline = ChosenVehicle.parse(options.vehicle), Deadline(options.timeout)
+    if choice.is_all and (options.timeout or math.inf) <= VEHICLES_LISTENING_TIME:
+        listening = f"--vehicle all listens for vehicles for {VEHICLES_LISTENING_TIME:g} s"
+        raise UsageError(f"--timeout {options.timeout:g} is too short: {listening} first")
     is_log = url.lower().startswith(f"{LinkKind.REPLAY}:")
     link = f"{url}?speed=0" if is_log and not is_live and "?speed=" not in url else url
     more = {"encoding": options.encoding, "listen_only": options.listen_only}
@@ -331,8 +334,7 @@ def open_client(url: str, options: TrafficOptions, **more: Any) -> ParamClient:
     Raises:
         UsageError: no such link.
     """
-    system, signing = options.source_system, options.signing
-    return ParamClient(url, tlog=options.tlog, signing=signing, system=system, **more)
+    return ParamClient(url, tlog=options.tlog, signing=options.signing, system=options.source_system, **more)
 
 
 # Vehicles
@@ -412,8 +414,16 @@ async def _find_by_uid(client: ParamClient, uid: str, timeout: float | None) -> 
     raise NoReply(awaited, attempts=0, waited=timeout or 0.0, hint=received_in_words(client))
 
 
-def _waiting(client: ParamClient, awaited: str) -> Status:
-    return Status(f"waiting for {awaited} on {client.link.name}", heard=lambda: received_in_words(client))
+@contextmanager
+def _waiting(client: ParamClient, awaited: str) -> Iterator[None]:
+    """Show what is awaited and what was received; print it after an interruption."""
+    what = f"waiting for {awaited}"
+    try:
+        with Status(f"{what} on {client.link.name}", heard=lambda: received_in_words(client)):
+            yield
+    except anyio.get_cancelled_exc_class():
+        say(f"interrupted while {what}. {received_in_words(client)}")
+        raise
 
 
 def received_in_words(client: ParamClient) -> str:

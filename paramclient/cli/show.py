@@ -9,16 +9,7 @@ from paramclient.cli.cached import show_summaries
 from paramclient.cli.json_output import info_json, info_of, param_value, set_json, table_param_json, taken
 from paramclient.cli.metadata import METADATA_HINT, MetadataFile, default_in, known_of_sets, say_sources
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import (
-    ExitCode,
-    cells_of,
-    local_time,
-    print_json,
-    print_line,
-    print_table,
-    report,
-    say,
-)
+from paramclient.cli.output import ExitCode, cells_of, local_time, print_json, print_line, print_table, say
 from paramclient.cli.session import check_given
 from paramclient.cli.sources import check_link, described, part_of
 from paramclient.errors import UsageError
@@ -78,7 +69,7 @@ async def show(
         shown = part_of(part, non_defaults(add_defaults(part, given))) if changed else part
         views.append((shown, known, defaults))
     if changed and not any(defaults for _, _, defaults in views):
-        report(NO_DEFAULTS)
+        say(NO_DEFAULTS)
         return ExitCode.INCOMPLETE
     items = [set_json(shown, known, whole=bool(chosen)) for shown, known, _ in views]
     if options.json:
@@ -134,7 +125,7 @@ def search(
     elif found:
         print_table(["name", "value", "vehicle", "description"], rows)
     if not found:
-        report(f"nothing found; {counted(len(known.names), 'parameter')} searched")
+        say(f"nothing found; {counted(len(known.names), 'parameter')} searched")
     if known.undescribed and not options.json:
         say(f"only names of {known.undescribed} were searched: {METADATA_HINT}")
     return ExitCode.DONE if found else ExitCode.INCOMPLETE

@@ -19,6 +19,7 @@ from paramclient.cli.session import ChosenVehicle, CommandSession, noun_of, sess
 from paramclient.client.component import Component
 from paramclient.errors import UsageError, VehicleError
 from paramclient.files import FileFormat, writable, write_file
+from paramclient.files.disk import check_folder
 from paramclient.files.formats import address, format_of_name
 from paramclient.links import LinkKind, parse_link
 from paramclient.metadata import Metadata
@@ -161,6 +162,8 @@ async def save(
             firmware.
     """
     written = file_format or format_of_name(str(file))
+    if not is_pattern_name(str(file.parent)):
+        check_folder(str(file))
     try:
         sets, is_part = await sets_of(where, options, incomplete=incomplete)
     except VehicleError as error:  # the table is incomplete

@@ -137,6 +137,7 @@ def test_the_vehicle_reboots_only_with_the_option(command: Command, put: Put, fi
     assert "1/1 ardupilot: takes effect after a reboot: EK2_ENABLE\n" in outcome.err
     outcome = command("apply", put(copter()), wanted, "--reboot", "--json")
     assert (outcome.code, outcome.json["reboots"], outcome.json["reboot_required"]) == (0, 1, [])
+    assert outcome.err == "", "the object has the summary"
 
 
 # Dry runs and confirmation

@@ -392,7 +392,9 @@ def test_a_fetch_that_is_interrupted_ends_cleanly(number: int, code: int, tmp_pa
         with process("fetch", url, "--cache", tmp_path / "cache.sqlite3") as fetching:
             listener.recv(100)  # the client has sent a request
             fetching.send_signal(number)
-            assert ended(fetching) == Outcome(code, "", "")
+            hint = f"Nothing was received on {url}. Is the address right, and does the vehicle listen there?"
+            expected = f"interrupted while waiting for an autopilot. {hint}\n"
+            assert ended(fetching) == Outcome(code, "", expected)
 
 
 @pytest.mark.parametrize("kept", [True, False])

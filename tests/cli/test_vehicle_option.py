@@ -100,6 +100,9 @@ def test_get_and_fetch_read_every_vehicle(command: Command, put: Put) -> None:
     fetched = command("fetch", url, "A", "--vehicle", "all")
     assert [line[:3] for line in fetched.words[1:]] == [["1/1", "A", "1.0"], ["4/1", "A", "1.0"]]
     assert len(re.findall(r" bytes received, [0-9,]+ sent on the whole link", fetched.err)) == 2
+    some = command("fetch", url, "A", "OF_PX4", "--vehicle", "all", "--json")
+    assert [[*each["params"]] for each in some.json["vehicles"]] == [["A", "OF_PX4"], ["A"]]
+    assert (some.code, [*some.json["vehicles"][1]["errors"]]) == (2, ["OF_PX4"])
 
 
 def test_all_reads_other_components_that_have_parameters_and_names_those_without(
