@@ -90,9 +90,10 @@ def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
             data = file.read(most)
     except OSError as error:
         raise UsageError(f"{os.fspath(path)}: the {what} cannot be read: {error.strerror}") from error
-    if sys.platform == "win32":  # it has neither such ids nor such modes
-        return data
-    if status.st_uid not in (os.geteuid(), 0):
+    if sys.platform != "win32" and status.st_uid not in (
+        os.geteuid(),
+        0,
+    ):  # it has neither such ids nor modes
         raise UsageError(
             f"{os.fspath(path)}: this {what} belongs to another user (id {status.st_uid}), who can change it;"
             " `chown` it to the user of this program"
@@ -102,7 +103,7 @@ def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
     # user, although no group can read it (systemd issue 29435)
     folder = os.environ.get(CREDENTIALS_VARIABLE)
     is_credential = folder and Path(path).resolve().parent == Path(folder).resolve()
-    if mode & (0o037 if is_credential else 0o077):
+    if sys.platform != "win32" and mode & (0o037 if is_credential else 0o077):
         raise UsageError(
             f"{os.fspath(path)}: other users than its owner can access this {what} (mode {mode:o}); "
             "run `chmod 600` on it, and replace it if another user may have read it"
