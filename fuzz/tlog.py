@@ -165,8 +165,8 @@ def _record_at(content: bytes, at: int) -> tuple[int, int] | None:
     time = int.from_bytes(head[:8], "big")
     if head[8] == 0xFE:
         return time, at + 16 + head[9]
-    if head[8] == 0xFD:
-        return time, at + 20 + head[9] + 13 * (head[10] & 1)
+    if head[8] == 0xFD and head[10] < 2:
+        return time, at + 20 + head[9] + 13 * head[10]
     return time, at
 
 

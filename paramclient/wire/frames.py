@@ -208,8 +208,8 @@ def frame_size(data: bytes, at: int) -> int | None:
         return None
     if data[at] == _MAGIC_V1:
         return 8 + data[at + 1]
-    if data[at] == _MAGIC_V2:
-        return 12 + data[at + 1] + (SIGNATURE_LENGTH if data[at + 2] & _SIGNED else 0)
+    if data[at] == _MAGIC_V2 and data[at + 2] <= _SIGNED:
+        return 12 + data[at + 1] + (SIGNATURE_LENGTH if data[at + 2] else 0)
     return 0
 
 
