@@ -145,12 +145,7 @@ def test_the_vehicle_reboots_only_with_the_option(command: Command, put: Put, fi
 
 @pytest.mark.parametrize(("answer", "sets"), [("y", 2), ("yes", 2), ("n", 0), ("", 0)])
 def test_a_user_at_a_terminal_must_confirm(
-    command: Command,
-    put: Put,
-    file: File,
-    at_terminal: Callable[[str], None],
-    answer: str,
-    sets: int,
+    command: Command, put: Put, file: File, at_terminal: Callable[[str], None], answer: str, sets: int
 ) -> None:
     vehicle = copter()
     at_terminal(answer)

@@ -12,6 +12,7 @@ import pytest
 
 from paramclient import ParamType, read_file
 from paramclient.sim import Air, ArduPilotVehicle, Camera, PX4Vehicle
+from tests.cli.test_no_reply import Deaf
 from tests.commands import Command, Put, metadata_file, strict
 from tests.conversations.partial import Partial
 from tests.shell import Eventful, Tap
@@ -125,13 +126,7 @@ def test_all_reads_other_components_that_have_parameters_and_names_those_without
 
 
 def test_one_vehicle_that_fails_stops_no_other(command: Command, put: Put) -> None:
-    class Mute(PX4Vehicle):
-        """A vehicle that receives nothing."""
-
-        def receive(self, data: bytes, now: float) -> None:
-            """Lose what is sent to the vehicle."""
-
-    url = put(Air([px4(), Mute(system=3, table=TABLE)]))
+    url = put(Air([px4(), Deaf(system=3, table=TABLE)]))
     read = command("get", url, "A", "--vehicle", "all", "--timeout", "20")
     assert read.code == 3
     assert [line[:2] for line in read.words[1:]] == [["1/1", "A"]]
