@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from ctypes import c_float
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 from paramclient.errors import UsageError
 from paramclient.model.names import counted
@@ -25,9 +25,6 @@ INSTANCE: Final = "{n}"
 """Placeholder of the number in the name and texts of a group of equal parameters."""
 
 Key = TypeVar("Key", int, int | float)
-
-_NO_NAMES: Final[Mapping[Any, str]] = MappingProxyType({})
-"""Shared by all descriptions without names: a garbage collection examines each object of a file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +58,8 @@ class ParamInfo:
     increment: int | float | None = None
     decimals: int | None = None
     default: int | float | None = None
-    values: Mapping[int | float, str] = field(default_factory=lambda: _NO_NAMES, hash=False)
-    bits: Mapping[int, str] = field(default_factory=lambda: _NO_NAMES, hash=False)
+    values: Mapping[int | float, str] = field(default_factory=dict, hash=False)
+    bits: Mapping[int, str] = field(default_factory=dict, hash=False)
     reboot_required: bool = False
     is_read_only: bool = False
     is_volatile: bool = False
@@ -239,12 +236,8 @@ class Metadata(Mapping[str, ParamInfo]):
 
     def defaults_of(self, names: Iterable[str]) -> dict[str, int | float]:
         """Return the firmware's defaults of those of the named parameters for which it is given."""
-        infos = {name: self.get(name) for name in names}
-        return {
-            name: info.default
-            for name, info in infos.items()
-            if info is not None and info.default is not None
-        }
+        found = ((name, info.default) for name in names if (info := self.get(name)) is not None)
+        return {name: default for name, default in found if default is not None}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.params)
@@ -255,11 +248,6 @@ class Metadata(Mapping[str, ParamInfo]):
     def __repr__(self) -> str:
         origin = f" from {self.source}" if self.source else ""
         return f"<Metadata of {counted(len(self), 'param')}{origin}>"
-
-
-def names_of(named: Mapping[Key, str]) -> Mapping[Key, str]:
-    """Return names of values or bits as a read-only mapping."""
-    return MappingProxyType(named) if named else _NO_NAMES
 
 
 def whole(number: int | float | None) -> int | float | None:

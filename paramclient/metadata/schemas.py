@@ -22,7 +22,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from paramclient.errors import UsageError
-from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, finite, names_of, number_of, whole
+from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, finite, number_of, whole
 from paramclient.model.values import ParamType
 
 # PX4
@@ -52,11 +52,11 @@ class _Bit(TypedDict):
 
 def _values_of(given: list[_Named]) -> Mapping[int | float, str]:
     named = {finite(each["value"]): each.get("description") for each in given}
-    return names_of({value: name for value, name in named.items() if name and value is not None})
+    return {value: name for value, name in named.items() if name and value is not None}
 
 
 def _bits_of(given: list[_Bit]) -> Mapping[int, str]:
-    return names_of({each["index"]: name for each in given if (name := each.get("description"))})
+    return {each["index"]: name for each in given if (name := each.get("description"))}
 
 
 _Number: TypeAlias = Annotated[float | None, AfterValidator(finite)]
@@ -257,13 +257,9 @@ def _named(items: Mapping[str, str] | str) -> dict[int | float, str]:
     return {code: name for code, name in named.items() if code is not None and name}
 
 
-def _named_values(items: Mapping[str, str] | str) -> Mapping[int | float, str]:
-    return names_of(_named(items))
-
-
 def _named_bits(items: Mapping[str, str] | str) -> Mapping[int, str]:
     named = _named(items).items()
-    return names_of({bit: name for bit, name in named if isinstance(bit, int) and 0 <= bit < BITS_MAX})
+    return {bit: name for bit, name in named if isinstance(bit, int) and 0 <= bit < BITS_MAX}
 
 
 def _number(text: str) -> int | float | None:
@@ -289,7 +285,7 @@ class _Described(BaseModel):
     units: str = Field("", alias="Units")
     range: Annotated[_Names, AfterValidator(_range)] = Field("", alias="Range")
     increment: Annotated[str, AfterValidator(_number)] = Field("", alias="Increment")
-    values: Annotated[_Names, AfterValidator(_named_values)] = Field("", alias="Values")
+    values: Annotated[_Names, AfterValidator(_named)] = Field("", alias="Values")
     bits: Annotated[_Names, AfterValidator(_named_bits)] = Field("", alias="Bitmask")
     reboot_required: _Flag = Field("", alias="RebootRequired")
     is_read_only: _Flag = Field("", alias="ReadOnly")

@@ -217,9 +217,7 @@ class MetadataStore:
     def known_of_sets(self, sets: Iterable[ParamSet]) -> list[Metadata | None]:
         """Return the metadata of each set's firmware; for a set without identity, that of another set."""
         own = [
-            None
-            if each.identity is None
-            else self.known(each.identity, AUTOPILOT if each.component is None else each.component)
+            None if each.identity is None else self.known(each.identity, each.component or AUTOPILOT)
             for each in sets
         ]
         first = next(filter(None, own), None)

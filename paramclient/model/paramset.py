@@ -224,21 +224,18 @@ def default_of(param: Param | WrittenParam, described: Value | None = None) -> D
     """
     if param.default is not None:
         return Default(param.default, DefaultSource.VEHICLE)
-    if described is None or isinstance(described, bytes):
+    if described is None:
         return None
     if param.type is None:
         return Default(described, DefaultSource.METADATA)
     try:
-        value = from_bits(bits_of(described, param.type), param.type)
+        return Default(from_bits(bits_of(described, param.type), param.type), DefaultSource.METADATA)
     except UsageError:  # not in the range of the type
         return None
-    return None if isinstance(value, bytes) else Default(value, DefaultSource.METADATA)
 
 
 def add_default(param: AnyParam, described: Value | None) -> AnyParam:
     """Return a parameter with its default; see `default_of`."""
-    if param.default is not None or described is None:
-        return param
     default = default_of(param, described)
     return param if default is None else replace(param, default=default.value)
 

@@ -120,12 +120,8 @@ def _group_of(name: str) -> re.Pattern[str] | None:
 
 
 def _candidates(names: Sequence[str], believed: frozenset[str]) -> Iterator[frozenset[str]]:
-    found: dict[re.Pattern[str], set[str]] = {}
-    for name in names:
-        group = _group_of(name)
-        if group is not None:
-            found.setdefault(group, set()).add(name)
-    groups = [frozenset(found[group]) for group in _GROUPS if group in found]
+    found = (frozenset(name for name in names if _group_of(name) is group) for group in _GROUPS)
+    groups = [each for each in found if each]
     usual = frozenset().union(*groups)
     first = (believed & frozenset(names)) | usual
     yield first
