@@ -8,6 +8,7 @@ history do not see. Each function runs in a transaction.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter, itemgetter
 from typing import Any, Final, NamedTuple
@@ -52,14 +53,14 @@ class Line(NamedTuple):
     new: StoredValue | None
 
 
-def add_lines(tx: Transaction, owner: int, lines: Iterable[Line]) -> None:
-    """Add history lines, and delete the oldest beyond `HISTORY_ENTRIES_MAX`."""
+def add_lines(tx: Transaction, owner: int, lines: Iterable[Line]) -> int:
+    """Add history lines, and delete the oldest beyond `HISTORY_ENTRIES_MAX`. Return the last one's number."""
     rows = [
         (owner, line.at, line.name, line.by, line.old_at, *(line.old or _NO_VALUE), *(line.new or _NO_VALUE))
         for line in sorted(lines, key=attrgetter("at"))
     ]
     if not rows:
-        return
+        return 0
     tx.many(f"INSERT INTO history (owner, {_LINE}) VALUES (?{', ?' * 8})", rows)
     found = tx.all(
         "SELECT at FROM history WHERE owner = ? ORDER BY at DESC, id DESC"
@@ -69,6 +70,17 @@ def add_lines(tx: Transaction, owner: int, lines: Iterable[Line]) -> None:
     for (at,) in found:
         tx.do("DELETE FROM history WHERE owner = ? AND at <= ?", (owner, at))
         tx.do("UPDATE component SET known_since = ? WHERE id = ? AND known_since < ?", (at, owner, at))
+    [(last,)] = tx.all("SELECT max(id) FROM history WHERE owner = ?", (owner,))
+    return int(last)
+
+
+def lines_since(tx: Transaction, owner: int, at: float) -> dict[str, list[tuple[int, StoredValue | None]]]:
+    """Return the numbers and new values of the lines since a time by parameter, as they were written."""
+    lines = defaultdict[str, list[tuple[int, StoredValue | None]]](list)
+    which = "SELECT id, name, new_type, new_value FROM history WHERE owner = ? AND at > ? ORDER BY id"
+    for number, name, *new in tx.all(which, (owner, at)):
+        lines[name].append((number, stored_value(new)))
+    return lines
 
 
 def load_lines(tx: Transaction, owner: int) -> dict[str, list[Line]]:

@@ -81,7 +81,6 @@ class StoredParam(NamedTuple):
         heard_at: time of the observation. The later of two observations of a parameter counts.
         default: the firmware's default in the form of the value, or None.
         by: author, if the value is a change: `BY_US`, `us for NAME`, `BY_VEHICLE` or `station 254/190`.
-        before: the value that the program held before a change; None if it held none, or is not known.
     """
 
     name: str
@@ -91,16 +90,10 @@ class StoredParam(NamedTuple):
     heard_at: float
     default: bytes | None = None
     by: str = BY_VEHICLE
-    before: StoredValue | None = None
 
     @classmethod
     def of(
-        cls,
-        param: Param | WrittenParam,
-        heard_at: float,
-        volatile: bool | None = None,
-        by: str = BY_VEHICLE,
-        before: Param | None = None,
+        cls, param: Param | WrittenParam, heard_at: float, volatile: bool | None = None, by: str = BY_VEHICLE
     ) -> StoredParam:
         """Return an observation of a parameter, whose type is known; its trust is not stored.
 
@@ -117,7 +110,6 @@ class StoredParam(NamedTuple):
             heard_at,
             None if default is None else StoredValue.of(number, bits_of(default, number)).value,
             by,
-            None if before is None else StoredValue.of(before.type, before.bits, is_raw=before.is_raw),
         )
 
     @classmethod
@@ -199,7 +191,7 @@ class HistoryEntry:
     by: str
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class SnapshotSummary:
     """A snapshot of a table, without its parameters.
 
@@ -225,10 +217,6 @@ class SnapshotSummary:
     hash: int | None
     complete: bool
     ended: bool | None = None
-
-    def __repr__(self) -> str:
-        what = f"{self.id} of {self.key}/{self.component}: {self.size} params, {_minute(self.at)}"
-        return f"<{type(self).__name__} {what}, {self.reason!r}>"
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import TypeVar
 
 import platformdirs
@@ -82,13 +81,12 @@ class ParamCache:
             self.path = Path(default_path() if path is None else path).resolve()
             self._store = SqliteStore(self.path)
         self.place = self._store.place
+        self._known_lines: dict[tuple[int, str], int] = {}
 
     def __enter__(self) -> ParamCache:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -100,7 +98,8 @@ class ParamCache:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """One text for each damaged file, or file of another version, that was renamed."""
+        """One text for each damaged file, or file of another version, that was renamed, and one if the last
+        writes to a file in a read-only folder are left out."""
         return tuple(self._store.notes)
 
     @property
@@ -127,12 +126,14 @@ class ParamCache:
         """
         updates = (update,) if isinstance(update, TableUpdate) else tuple(update)
 
-        def work(tx: Transaction) -> None:
+        def work(tx: Transaction) -> dict[tuple[int, str], int]:
+            known = dict(self._known_lines)
             for each in updates:
-                save_table(tx, each, time.time())
+                save_table(tx, each, time.time(), known)
+            return known
 
         if updates or durable:
-            self._store.run(work, writing=True, durable=durable)
+            self._known_lines = self._store.run(work, writing=True, durable=durable)
 
     def merge(self, updates: Sequence[TableUpdate]) -> None:
         """Insert earlier observations, such as those of a log, by their times, in one transaction.

@@ -16,7 +16,7 @@ from operator import attrgetter
 from typing import Any, Final
 
 from paramclient.cache.database import IDENTITY, Transaction
-from paramclient.cache.history import SAME_CHANGE_MAX, Line, add_lines, load_lines, merged_lines
+from paramclient.cache.history import SAME_CHANGE_MAX, Line, add_lines, lines_since, load_lines, merged_lines
 from paramclient.cache.records import (
     CachedComponent,
     CachedSummary,
@@ -207,8 +207,16 @@ def ensure_table(
     return _upsert_table(tx, new, math.inf) if found is None else found
 
 
-def save_table(tx: Transaction, update: TableUpdate, now: float) -> None:
-    """Write an update with its history lines; `now` is the current time in unix seconds."""
+def save_table(tx: Transaction, update: TableUpdate, now: float, known: dict[tuple[int, str], int]) -> None:
+    """Write an update with its history lines.
+
+    Args:
+        tx: the transaction.
+        update: the update.
+        now: the current time in unix seconds.
+        known: the last line that the program has written, or has received too, by table and name. Another
+            program may have written later ones of changes that this one, on a busy computer, receives late.
+    """
     horizon = max(now, update.at) + CLOCK_SLACK
     before = find_table(tx, update.identity.key, update.component, extended=update.extended)
     owner = _upsert_table(tx, update, horizon).owner
@@ -223,8 +231,19 @@ def save_table(tx: Transaction, update: TableUpdate, now: float) -> None:
     agrees = is_whole = True
     is_rehashed = False
     lines: list[Line] = []
+    recent = lines_since(tx, owner, update.at - SAME_CHANGE_MAX)
+
+    def is_recorded(item: StoredParam) -> bool:
+        """Return whether another program has stored this change, and a later one."""
+        row, last = rows.get(item.name), known.get((owner, item.name), 0)
+        for number, value in recent.get(item.name, ()):
+            if number > last and is_same_value(value, item.stored):
+                known[owner, item.name] = number
+                return not is_same_value(row and row.stored, item.stored)
+        return False
+
     for batch in _rounds(observed):
-        new = [item for item in batch if not _is_recorded(tx, owner, item, rows.get(item.name))]
+        new = [item for item in batch if not is_recorded(item)]
         agrees = agrees and len(new) == len(batch)
         items = [_completed(item, rows.get(item.name), is_whole=update.replace) for item in new]
         for item, has_won in zip(items, _write_rows(tx, owner, items, horizon), strict=True):
@@ -239,7 +258,7 @@ def save_table(tx: Transaction, update: TableUpdate, now: float) -> None:
                 lines.append(Line(item.heard_at, item.name, item.by, old_at, old_value, item.stored))
             rows[item.name] = item
             is_rehashed = is_rehashed or item.hashed != (old and old.hashed)
-    add_lines(tx, owner, lines)
+    known |= dict.fromkeys(((owner, line.name) for line in lines), add_lines(tx, owner, lines))
     kept = TableState() if before is None else before.summary
     is_late = before is not None and update.at < before.summary.updated_at <= horizon
     state = _state_to_write(update, kept, agrees=agrees, is_late=is_late) if is_whole else None
@@ -316,17 +335,6 @@ def _rounds(items: Iterable[StoredParam]) -> list[list[StoredParam]]:
         rounds[count[item.name]].append(item)
         count[item.name] += 1
     return rounds
-
-
-def _is_recorded(tx: Transaction, owner: int, item: StoredParam, row: StoredParam | None) -> bool:
-    """Return whether another program has stored this change, and a later one: on a busy computer, a program
-    reads messages some time after another one."""
-    stored, old, new = row and row.stored, item.before, item.stored
-    if not (stored and old and new) or stored.is_same(old) or stored.is_same(new):
-        return False
-    which = "owner = ? AND name = ? AND at > ? AND old_value = ? AND new_value = ?"
-    values = owner, item.name, item.heard_at - SAME_CHANGE_MAX, old.value, new.value
-    return bool(tx.all(f"SELECT id FROM history WHERE {which}", values))
 
 
 def _completed(item: StoredParam, old: StoredParam | None, *, is_whole: bool) -> StoredParam:

@@ -378,16 +378,16 @@ def update_of(
     def unix(moment: float) -> float:
         return round(moment + ahead, 6)  # a printed time, whose digits are cut off, is never later
 
-    def stored(param: Param, moment: float, by: str = BY_VEHICLE, old: Param | None = None) -> StoredParam:
+    def observed(param: Param, moment: float, by: str = BY_VEHICLE) -> StoredParam:
         is_volatile = param.name in table.volatile if table.volatile or table.volatile_is_known else None
-        return StoredParam.of(table.with_default(param), unix(moment), is_volatile, by, old)
+        return StoredParam.of(table.with_default(param), unix(moment), is_volatile, by)
 
     params = [
-        StoredParam.gone(one.name, unix(when)) if one.new is None else stored(one.new, when, one.by, one.old)
-        for one, when in record.changes
+        StoredParam.gone(each.name, unix(moment)) if each.new is None else observed(each.new, moment, each.by)
+        for each, moment in record.changes
     ]
     if record.is_whole:
-        params += [stored(param, table.moments[name]) for name, param in table.params.items()]
+        params += [observed(param, table.moments[name]) for name, param in table.params.items()]
     state = TableState(
         hash=table.hash if table.is_complete else None,
         count=table.count,

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 
 from paramclient.cache import SNAPSHOTS, ParamCache, StoredParam, TableState, history
-from paramclient.cache.records import StoredValue
 from paramclient.errors import CacheError, UnknownVehicle, UsageError
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType, ext_param
@@ -45,18 +44,19 @@ def test_each_change_has_one_line(cache: ParamCache, open_cache: Open) -> None:
 
 
 def test_a_program_that_reads_late_repeats_no_change(cache: ParamCache, open_cache: Open) -> None:
-    def observe(program: ParamCache, old: int, new: int, at: float) -> None:
-        row = stored("PARAM_0", new, at=NOW + at)
-        before = StoredValue.of(ParamType.INT32, old)
-        program.save(update(row._replace(before=before), at=NOW + at))
+    late = open_cache()
+
+    def observe(program: ParamCache, at: float, *values: int) -> None:
+        for step, value in enumerate(values):
+            moment = NOW + at + step / 10
+            program.save(update(stored("PARAM_0", value, at=moment), at=moment))
 
     cache.save(whole_table(1))
-    for program, delay in ((cache, 0.0), (open_cache(), 0.5)):
-        for step in range(3):
-            observe(program, step, step + 1, delay + step / 10)
-    observe(cache, 3, 2, 1.0)
-    assert [line[2:4] for line in lines(cache)] == [(0, 1), (1, 2), (2, 3), (3, 2)]
-    assert values(cache) == {"PARAM_0": 2}
+    observe(cache, 0.0, 1, 2, 0, 1, 0)
+    observe(late, 0.5, 1, 2, 0, 1, 0, 2)
+    observe(cache, 1.2, 2, 0)
+    assert [line[2:4] for line in lines(cache)] == [(0, 1), (1, 2), (2, 0), (0, 1), (1, 0), (0, 2), (2, 0)]
+    assert values(cache) == {"PARAM_0": 0}
 
 
 def test_zero_and_negative_zero_are_one_value(cache: ParamCache) -> None:
