@@ -181,7 +181,7 @@ class Store(ABC):
 
     Attributes:
         place: as given.
-        notes: one text for each file that was set aside.
+        notes: one text for each file that was set aside, and for writes that are left out.
         replacements: number of times that another file has taken the place of one that was used.
     """
 
@@ -265,7 +265,7 @@ class SqliteStore(Store):
             self._drop()
             self._file = None
             self.replacements += 1
-        if not writing and not self._path.exists():
+        if not writing and self._which() is None:
             return _read_nothing(work)
         if self._is_read_only:  # another process may have written since
             self._drop()
@@ -319,6 +319,8 @@ class SqliteStore(Store):
         self._is_read_only = not writing and _is_unwritable(connection)
         if self._is_read_only:
             connection.close()
+            if Path(f"{self._path}-wal").exists():
+                self._warn(_WITHOUT_WAL.format(self.place))
             return _connect(f"{self._path.as_uri()}?mode=ro&immutable=1")
         connection.execute("PRAGMA foreign_keys = ON")
         connection.execute("PRAGMA synchronous = NORMAL")
@@ -357,8 +359,18 @@ class SqliteStore(Store):
                     Path(f"{self._path}{suffix}").rename(self._path.with_name(name + suffix))
         except OSError as error:
             raise CacheError(f"the cache {self.place} is {kind}, and cannot be renamed: {error}") from error
-        self.notes.append(f"the cache {self.place} is {_KINDS[kind]}. It is kept as {name}; a new one begins")
-        logger.warning("%s", self.notes[-1])
+        self._warn(f"the cache {self.place} is {_KINDS[kind]}. It is kept as {name}; a new one begins")
+
+    def _warn(self, note: str) -> None:
+        """Log a warning, once."""
+        if note not in self.notes:
+            self.notes.append(note)
+            logger.warning("%s", note)
+
+
+_WITHOUT_WAL: Final = (
+    "the last writes, in {0}-wal, are left out: the folder is read-only. Copy it, and open the cache there"
+)
 
 
 _KINDS: Final = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -98,8 +99,10 @@ def test_a_file_that_is_no_cache_is_renamed_with_one_warning(
 
 def test_a_place_that_cannot_be(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with ParamCache(tmp_path / "file" / "cache") as cache, pytest.raises(CacheError, match="cannot be used"):
-        cache.save(whole_table(1))
+    with ParamCache(tmp_path / "file" / "cache") as cache:
+        for use in (cache.vehicles, lambda: cache.save(whole_table(1))):
+            with pytest.raises(CacheError, match="cannot be used"):
+                use()
     with pytest.raises(UsageError, match="not valid"):
         ParamCache("postgresql://a b")
 
@@ -111,6 +114,21 @@ def test_a_reader_that_may_not_write_sees_what_is_written_later(path: Path) -> N
         with ParamCache(path) as other:
             other.save(update(stored("PARAM_0", 5, at=NOW + 1), at=NOW + 1))
         assert values(reader)["PARAM_0"] == 5
+
+
+def test_a_reader_says_that_it_may_not_use_the_last_writes(
+    path: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "read-only"
+    folder.mkdir()
+    with ParamCache(filled(path)) as cache:
+        cache.save(update(stored("PARAM_0", 5, at=NOW + 1), at=NOW + 1))
+        for each in (path, path.with_name(f"{path.name}-wal")):
+            shutil.copy(each, folder)
+    with read_only(folder), ParamCache(folder / path.name) as reader:
+        assert [values(reader)["PARAM_0"] for _ in range(2)] == [0, 0]
+        assert reader.notes == (*(record.getMessage() for record in caplog.records),)
+        assert f"{path.name}-wal" in reader.notes[0]
 
 
 # several processes
