@@ -11,7 +11,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter, itemgetter
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from paramclient.cache.database import Transaction
 from paramclient.cache.records import (
@@ -74,12 +74,16 @@ def add_lines(tx: Transaction, owner: int, lines: Iterable[Line]) -> int:
     return int(last)
 
 
-def lines_since(tx: Transaction, owner: int, at: float) -> dict[str, list[tuple[int, StoredValue | None]]]:
-    """Return the numbers and new values of the lines since a time by parameter, as they were written."""
-    lines = defaultdict[str, list[tuple[int, StoredValue | None]]](list)
-    which = "SELECT id, name, new_type, new_value FROM history WHERE owner = ? AND at > ? ORDER BY id"
-    for number, name, *new in tx.all(which, (owner, at)):
-        lines[name].append((number, stored_value(new)))
+Written: TypeAlias = tuple[int, float, StoredValue | None]
+"""The number of a line, its time and its new value."""
+
+
+def lines_since(tx: Transaction, owner: int, since: float) -> dict[str, list[Written]]:
+    """Return the lines since a time by parameter, in the order in which they were written."""
+    lines = defaultdict[str, list[Written]](list)
+    which = "SELECT id, at, name, new_type, new_value FROM history WHERE owner = ? AND at > ? ORDER BY id"
+    for number, at, name, *new in tx.all(which, (owner, since)):
+        lines[name].append((number, at, stored_value(new)))
     return lines
 
 

@@ -231,13 +231,15 @@ def save_table(tx: Transaction, update: TableUpdate, now: float, known: dict[tup
     agrees = is_whole = True
     is_rehashed = False
     lines: list[Line] = []
-    recent = lines_since(tx, owner, update.at - SAME_CHANGE_MAX)
+    first = min((item.heard_at for item in observed), default=update.at)
+    recent = lines_since(tx, owner, first - SAME_CHANGE_MAX)
 
     def is_recorded(item: StoredParam) -> bool:
         """Return whether another program has stored this change, and a later one."""
         row, last = rows.get(item.name), known.get((owner, item.name), 0)
-        for number, value in recent.get(item.name, ()):
-            if number > last and is_same_value(value, item.stored):
+        for number, at, value in recent.get(item.name, ()):
+            is_near = number > last and at > item.heard_at - SAME_CHANGE_MAX
+            if is_near and is_same_value(value, item.stored):
                 known[owner, item.name] = number
                 return not is_same_value(row and row.stored, item.stored)
         return False

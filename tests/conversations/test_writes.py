@@ -218,19 +218,16 @@ async def test_a_late_answer_with_an_old_value_undoes_no_change() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     async with talking(Air.symmetric([vehicle], delay=0.005)) as (conversation, session):
         await fetch_all(session)
-        for step in range(8):
+        for step in range(16):
             async with meanwhile(read(session, "ATC_ANG_RLL_P")):
-                await anyio.sleep(0.013 * step)
-                await write(session, "ATC_ANG_RLL_P", 3.0 + step)
+                await anyio.sleep(0.013 * (step % 8))
+                if step < 8:
+                    await write(session, "ATC_ANG_RLL_P", 3.0 + step)
+                else:
+                    vehicle.set_param("ATC_ANG_RLL_P", 3.0 + step)  # by another station
             await anyio.sleep(1.0)
             assert session.table.params["ATC_ANG_RLL_P"].value == 3.0 + step
-        for step in range(8):
-            async with meanwhile(read(session, "ATC_ANG_RLL_P")):
-                await anyio.sleep(0.013 * step)
-                vehicle.set_param("ATC_ANG_RLL_P", 20.0 + step)  # by another station
-            await anyio.sleep(1.0)
         changes = [each for each in conversation.changes if each.kind == "changed"]
-        assert [each.new and each.new.value for each in changes] == [*range(3, 11), *range(20, 28)]
         assert [each.by for each in changes] == ["us"] * 8 + ["vehicle"] * 8
         # a write back is no late answer, and a change back by another station is found by a read
         await write(session, "ATC_ANG_RLL_P", 3.5)
