@@ -185,8 +185,7 @@ async def confirm(question: str) -> bool:
 
     Cancellation, as by Ctrl-C, ends the question.
     """
-    sys.stderr.write(printable(f"{question} [y/N] "))
-    sys.stderr.flush()
+    print(printable(f"{question} [y/N] "), end="", file=sys.stderr, flush=True)
     if sys.platform == "win32":  # a console cannot be waited for
         answer = await anyio.to_thread.run_sync(sys.stdin.readline, abandon_on_cancel=True)
     else:
@@ -213,11 +212,12 @@ async def require_consent(question: str, otherwise: str) -> None:
 class Status:
     """The line on stderr, if that is a terminal, that says what the command awaits, until its block ends.
 
-    Several at once share the line. It is erased before any other output, and at the end.
+    Several at once share the line. It is erased before any other output, and at the end. After an
+    interruption, a line without a progress is printed, on a terminal or not.
 
     Args:
         awaited: what is awaited before the first progress.
-        title: the beginning of the line that shows the progress.
+        title: the beginning of the line that shows the progress; "" if there is none.
         heard: returns what was received so far, as a sentence.
     """
 
@@ -237,11 +237,13 @@ class Status:
             self._active.append(self)
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if self in self._active:
             self._next.cancel()
             self._active.remove(self)
             self.erase()
+        if not self._title and kind is asyncio.CancelledError:
+            say(f"interrupted while {self._awaited}. {self._heard()}".rstrip())
 
     def count(self, received: int, total: int | None) -> None:
         """Show a progress at the next update, with the rate since the first one."""
@@ -260,15 +262,14 @@ class Status:
     def erase(cls) -> None:
         """Erase the line, until it is drawn again."""
         if cls._is_drawn:
-            sys.stderr.write(ERASE)
-            sys.stderr.flush()
+            print(ERASE, end="", file=sys.stderr, flush=True)
             cls._is_drawn = False
 
     def _tick(self) -> None:
         self._next = self._loop.call_later(NOTICE_INTERVAL, self._tick)
         line = printable("; ".join(each._text for each in self._active))
-        sys.stderr.write(f"{ERASE}{line[: shutil.get_terminal_size().columns - 1]}")
-        sys.stderr.flush()
+        shown = line[: shutil.get_terminal_size().columns - 1]
+        print(f"{ERASE}{shown}", end="", file=sys.stderr, flush=True)
         Status._is_drawn = True
 
     @property

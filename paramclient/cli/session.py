@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager, contextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Final, Protocol, TypeVar
 
@@ -414,16 +414,8 @@ async def _find_by_uid(client: ParamClient, uid: str, timeout: float | None) -> 
     raise NoReply(awaited, attempts=0, waited=timeout or 0.0, hint=received_in_words(client))
 
 
-@contextmanager
-def _waiting(client: ParamClient, awaited: str) -> Iterator[None]:
-    """Show what is awaited and what was received; print it after an interruption."""
-    what = f"waiting for {awaited}"
-    try:
-        with Status(f"{what} on {client.link.name}", heard=lambda: received_in_words(client)):
-            yield
-    except anyio.get_cancelled_exc_class():
-        say(f"interrupted while {what}. {received_in_words(client)}")
-        raise
+def _waiting(client: ParamClient, awaited: str) -> Status:
+    return Status(f"waiting for {awaited} on {client.link.name}", heard=lambda: received_in_words(client))
 
 
 def received_in_words(client: ParamClient) -> str:

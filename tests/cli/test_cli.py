@@ -393,7 +393,7 @@ def test_a_fetch_that_is_interrupted_ends_cleanly(number: int, code: int, tmp_pa
             listener.recv(100)  # the client has sent a request
             fetching.send_signal(number)
             hint = f"Nothing was received on {url}. Is the address right, and does the vehicle listen there?"
-            expected = f"interrupted while waiting for an autopilot. {hint}\n"
+            expected = f"interrupted while waiting for an autopilot on {url}. {hint}\n"
             assert ended(fetching) == Outcome(code, "", expected)
 
 
