@@ -254,10 +254,8 @@ class KeptTable(Stream[Change]):
     def push(self, item: Change) -> None:
         """Take a change, and announce it unless it is a first value."""
         self.changes += 1
-        if item.new is not None:
-            self._unknown.pop(item.name, None)
-            if item.kind != "first" and not self.is_lost:
-                self._announce(self, value_of(self.session, item.new))
+        if item.new is not None and item.kind != "first" and not self.is_lost:
+            self._announce(self, value_of(self.session, item.new))
 
     # lists
 

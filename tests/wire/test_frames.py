@@ -382,11 +382,9 @@ def pool() -> list[bytes]:
     return frames
 
 
-def test_a_flood_of_a_first_byte_has_no_candidates_but_at_its_end() -> None:
+def test_a_flood_of_a_first_byte_has_no_candidates() -> None:
     """Each would take 5 µs: 0.3 s of a chunk, in which others wait."""
-    found = find_magic(b"\xfd" * 65_536)
-    assert found is not None
-    assert found.start() == 65_534
+    assert find_magic(b"\xfd" * 65_536 + b"\xff\xff") is None
 
 
 whole = st.sampled_from(pool())
