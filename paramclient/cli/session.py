@@ -449,9 +449,12 @@ async def get_chosen(
         names = [spelling(text, component)]
         if is_pattern(text):
             names = sorted(NameChoice([text]).divide(component.params)[0])
+        elif is_fetched and session.client.listens_only and names[0] not in component.params:
+            names = []
         if not names:
-            what = f"{session.address} has no parameter that matches {text}"
-            found[text] = UnknownParameter(what, *component.address, name=text)
+            nearest = nearest_names(text, component.params)
+            what = f"{session.address} has no parameter that matches {text}{did_you_mean(nearest)}"
+            found[text] = UnknownParameter(what, *component.address, name=text, nearest=nearest)
         for name in names:
             known = component.params.get(name) if is_fetched else None
             found[name] = None if known is None or known.trust is Trust.CACHED else known

@@ -271,6 +271,12 @@ def test_watch_does_not_count_the_parameters_of_a_log_before_it_is_read(command:
     assert (watched.code, watched.err) == (0, "watching all parameters of 1/1 px4\n")
 
 
+def test_a_name_that_a_log_does_not_have_is_named(command: Command) -> None:
+    fetched = command("fetch", f"replay:{ROOT}/tests/data/px4_full_download.tlog", "MC_ROLL_PP", "--no-cache")
+    assert fetched.code == 2
+    assert fetched.err.endswith("1/1 has no parameter that matches MC_ROLL_PP; did you mean MC_ROLL_P?\n")
+
+
 def test_a_link_that_fails_during_watch_is_reported_once(command: Command, put: Put) -> None:
     def fail() -> None:
         raise LinkError("it is gone", link=URL)
