@@ -825,6 +825,16 @@ async def test_rule_10_a_list_of_all_components() -> None:
         assert asked == [ParamRequestList(1, 5)]
 
 
+async def test_rule_10_what_is_asked_of_all_components() -> None:
+    """A read is answered by those that have the name, and a set is one of the autopilot."""
+    gimbal = generic(component=5, table={"TILT": 1.0})
+    async with in_sync(Air([gimbal, small_px4()])) as (served, _, station):
+        await (await served.clients[0].component(1, 5)).fetch_all()
+        write = ParamSet(1, 0, "PARAM_01", struct.pack("<i", 9), ParamType.INT32)
+        await station.ask(ParamRequestRead(1, 0, "TILT", -1), write, seconds=1.0)
+        assert by_name(station) == {"TILT": struct.pack("<f", 1), "PARAM_01": struct.pack("<i", 9)}
+
+
 async def test_rule_10_two_vehicles_with_one_id(caplog: pytest.LogCaptureFixture) -> None:
     vehicles = [Tap(small_px4()), Tap(small_px4())]
     async with gateway_over(*vehicles) as served:
