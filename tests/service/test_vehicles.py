@@ -130,8 +130,7 @@ async def test_fetches_at_one_time_share_a_download_and_tell_their_progress() ->
         results = await asyncio.gather(*(browser.post(f"{V}/fetch", json={}) for _ in range(3)))
         assert {answer.json()["received"] for answer in results} == {len(VALUES) + 1}
         assert len({answer.json()["elapsed_s"] for answer in results}) == 1
-        again = (await browser.post(f"{V}/fetch", json={})).json()
-        assert again["source"] == "cache"
+        assert (await browser.post(f"{V}/fetch", json={})).json()["source"] == "cache"
         assert (await browser.post(f"{V}/fetch", json={"refresh": True})).json()["source"] != "cache"
         assert (await vehicle(browser) or {})["fetches"] >= 3
 
@@ -187,13 +186,12 @@ async def test_extended_parameters_are_fetched_written_and_followed() -> None:
         wide = {"value": "9007199254740993"}  # as text, of which a float has not all digits
         done = await browser.put(f"{CAMERA}/params/WIDE", params=EXT, json=wide)
         assert done.json()["actual"] == 9007199254740993
-        text = "CAM_NAME"
-        done = await browser.put(f"{CAMERA}/params/{text}", params=EXT, json={"value": "Rear"})
+        done = await browser.put(f"{CAMERA}/params/CAM_NAME", params=EXT, json={"value": "Rear"})
         assert (done.json()["status"], done.json()["actual"]) == ("accepted", "Rear")
-        body = {"values": {text: "hex:ff00fe"}}
+        body = {"values": {"CAM_NAME": "hex:ff00fe"}}
         (result,) = (await browser.patch(f"{CAMERA}/params", params=EXT, json=body)).json()["results"]
         assert result["actual"] == "hex:ff00fe"
-        live = await browser.get(f"{CAMERA}/params/{text}", params={**EXT, "live": "true"})
+        live = await browser.get(f"{CAMERA}/params/CAM_NAME", params={**EXT, "live": "true"})
         assert live.json()["value"] == "hex:ff00fe"
         problem(await browser.get(f"{CAMERA}/params/NOPE", params=EXT), 404, "unknown-parameter")
 
