@@ -13,26 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from paramclient.errors import UsageError
+from paramclient.model import values
 from paramclient.model.paramset import WrittenParam
-from paramclient.model.values import (
-    EXT_VALUE_SIZE,
-    Encoding,
-    Param,
-    ParamType,
-    Trust,
-    Value,
-    check_ext_value,
-    check_name,
-    check_value,
-    decode_value,
-    encode_ext_value,
-    encode_value,
-    ext_bytes,
-    ext_param,
-    format_value,
-    from_bits,
-    same_bits,
-)
+from paramclient.model.values import Encoding, Param, ParamType, Trust, Value
 from paramclient.protocol.dialect import PLAIN
 
 BYTEWISE, C_CAST = Encoding.BYTEWISE, Encoding.C_CAST
@@ -103,20 +86,20 @@ def test_four_bytes_round_trip(pattern: int) -> None:
     """Decoding loses no bit of a 4-byte value, nor does encoding a value that is not raw."""
     raw = pattern.to_bytes(4, "little")
     for kind, layout in ((ParamType.UINT32, "<I"), (ParamType.INT32, "<i")):
-        value, bits = decode_value(raw, kind, BYTEWISE)
+        value, bits = values.decode_value(raw, kind, BYTEWISE)
         assert (value, bits) == (struct.unpack(layout, raw)[0], pattern)
-        assert encode_value(value, kind, BYTEWISE) == raw
-        assert from_bits(bits, kind) == value
+        assert values.encode_value(value, kind, BYTEWISE) == raw
+        assert values.from_bits(bits, kind) == value
     for encoding in Encoding:
-        value, bits = decode_value(raw, ParamType.REAL32, encoding)
+        value, bits = values.decode_value(raw, ParamType.REAL32, encoding)
         assert isinstance(value, float)
         assert bits == pattern
         if math.isnan(value):
-            assert math.isnan(from_bits(bits, ParamType.REAL32))  # type: ignore[arg-type]  # float, as the type is REAL32
-            assert encode_value(raw, ParamType.REAL32, encoding) == raw
+            assert math.isnan(values.from_bits(bits, ParamType.REAL32))  # type: ignore[arg-type]  # float, as the type is REAL32
+            assert values.encode_value(raw, ParamType.REAL32, encoding) == raw
         else:
-            assert encode_value(value, ParamType.REAL32, encoding) == raw
-            assert from_bits(bits, ParamType.REAL32) == value
+            assert values.encode_value(value, ParamType.REAL32, encoding) == raw
+            assert values.from_bits(bits, ParamType.REAL32) == value
 
 
 @pytest.mark.parametrize(
@@ -134,8 +117,8 @@ def test_four_bytes_round_trip(pattern: int) -> None:
 def test_bytewise_encodes_the_value_in_the_first_bytes(
     kind: ParamType, raw: str, value: float, bits: int
 ) -> None:
-    assert decode_value(bytes.fromhex(raw), kind, BYTEWISE) == (value, bits)
-    assert encode_value(value, kind, BYTEWISE) == bytes.fromhex(raw)
+    assert values.decode_value(bytes.fromhex(raw), kind, BYTEWISE) == (value, bits)
+    assert values.encode_value(value, kind, BYTEWISE) == bytes.fromhex(raw)
 
 
 # C-cast
@@ -161,15 +144,15 @@ def test_c_cast_decodes_to_the_integer_or_stays_raw(
     kind: ParamType, number: float, value: int | None
 ) -> None:
     raw = struct.pack("<f", number)
-    read, bits = decode_value(raw, kind, C_CAST)
+    read, bits = values.decode_value(raw, kind, C_CAST)
     if value is None:
         assert (read, bits) == (raw, int.from_bytes(raw, "little"))
-        assert from_bits(bits, kind, is_raw=True) == raw
+        assert values.from_bits(bits, kind, is_raw=True) == raw
     else:
         assert type(read) is int
         assert read == value
         assert bits == value % 2 ** (8 * kind.size)
-        assert from_bits(bits, kind) == value
+        assert values.from_bits(bits, kind) == value
 
 
 @thorough
@@ -179,39 +162,39 @@ def test_c_cast_encodes_an_integer_exactly_or_rejects_it(kind: ParamType, data: 
     near = st.sampled_from([sign * 2**n + step for n in range(65) for sign in (-1, 1) for step in (-1, 0, 1)])
     value = data.draw(st.integers(low, high) | near.filter(lambda v: low <= v <= high))
     if as_float32(value) == value:
-        raw = encode_value(value, kind, C_CAST)
+        raw = values.encode_value(value, kind, C_CAST)
         assert raw == struct.pack("<f", value)
-        assert decode_value(raw, kind, C_CAST)[0] == value
-        assert encode_value(float(value), kind, C_CAST) == raw
+        assert values.decode_value(raw, kind, C_CAST)[0] == value
+        assert values.encode_value(float(value), kind, C_CAST) == raw
     else:
         assert abs(value) > 2**24
         with pytest.raises(UsageError, match=f"nearest is {int(as_float32(value))}"):
-            encode_value(value, kind, C_CAST)
+            values.encode_value(value, kind, C_CAST)
 
 
 @pytest.mark.parametrize("kind", INTEGERS)
 def test_c_cast_sends_a_fraction_unchanged(kind: ParamType) -> None:
-    assert encode_value(12.7, kind, C_CAST) == struct.pack("<f", 12.7)
-    assert decode_value(encode_value(12.7, kind, C_CAST), kind, C_CAST) == (12, 12)
+    assert values.encode_value(12.7, kind, C_CAST) == struct.pack("<f", 12.7)
+    assert values.decode_value(values.encode_value(12.7, kind, C_CAST), kind, C_CAST) == (12, 12)
 
 
 def test_a_real64_is_sent_as_float32_only_by_a_c_cast() -> None:
     raw = struct.pack("<f", 0.1)
-    value, bits = decode_value(raw, ParamType.REAL64, C_CAST)
-    assert (value, from_bits(bits, ParamType.REAL64)) == (as_float32(0.1), value)
-    assert encode_value(0.1, ParamType.REAL64, C_CAST) == raw
-    assert decode_value(raw, ParamType.REAL64, BYTEWISE) == (raw, int.from_bytes(raw, "little"))
+    value, bits = values.decode_value(raw, ParamType.REAL64, C_CAST)
+    assert (value, values.from_bits(bits, ParamType.REAL64)) == (as_float32(0.1), value)
+    assert values.encode_value(0.1, ParamType.REAL64, C_CAST) == raw
+    assert values.decode_value(raw, ParamType.REAL64, BYTEWISE) == (raw, int.from_bytes(raw, "little"))
 
 
 @pytest.mark.parametrize("encoding", Encoding)
 def test_real32_rounds_keeps_infinities_and_rejects_overflow(encoding: Encoding) -> None:
-    assert encode_value(0.1, ParamType.REAL32, encoding) == bytes.fromhex("cdcccc3d")
-    assert encode_value(1, ParamType.REAL32, encoding) == struct.pack("<f", 1.0)
-    assert encode_value(-math.inf, ParamType.REAL32, encoding) == bytes.fromhex("000080ff")
-    assert math.isnan(struct.unpack("<f", encode_value(math.nan, ParamType.REAL32, encoding))[0])
+    assert values.encode_value(0.1, ParamType.REAL32, encoding) == bytes.fromhex("cdcccc3d")
+    assert values.encode_value(1, ParamType.REAL32, encoding) == struct.pack("<f", 1.0)
+    assert values.encode_value(-math.inf, ParamType.REAL32, encoding) == bytes.fromhex("000080ff")
+    assert math.isnan(struct.unpack("<f", values.encode_value(math.nan, ParamType.REAL32, encoding))[0])
     for value in (3.5e38, -3.5e38, 10**400):
         with pytest.raises(UsageError, match="float32"):
-            encode_value(value, ParamType.REAL32, encoding)
+            values.encode_value(value, ParamType.REAL32, encoding)
 
 
 # Arguments of callers
@@ -234,23 +217,27 @@ NO_VALUES = [
 @pytest.mark.parametrize(
     ("check", "argument", "words"),
     [
-        (check_name, "", "at least one"),
-        (check_name, "SEVENTEEN_LETTERS", "17 bytes"),
-        *((check_name, name, "ASCII") for name in ("GRÖSSE", "A\0B", "A\n", "\x7f")),
-        (check_name, b"BYTES", "not bytes"),
-        (check_name, None, "not NoneType"),
-        *((check_value, each, "parameter") for each in NO_VALUES),
-        (check_ext_value, "x" * 129, "129 bytes; an extended parameter holds 128"),
-        (check_ext_value, "a\0b", "without NUL"),
-        (check_ext_value, "\ud800", "UTF-8"),
-        (check_ext_value, None, "not NoneType"),
-        (check_ext_value, Decimal("sNaN"), "number in the range of a float"),
-        (lambda value: encode_value(value, ParamType.REAL64, BYTEWISE), 0.5, "takes 8 bytes"),
-        (lambda value: encode_value(value, ParamType.UINT8, C_CAST), 256, "UINT8, which holds 0 to 255"),
-        (lambda value: encode_value(value, 77, C_CAST), 5, "not a type that MAVLink defines"),
-        (lambda value: encode_ext_value(value, ParamType.UINT8), "tea", "'tea' is not a number"),
-        (lambda value: encode_ext_value(value, ParamType.CUSTOM), 5, "5 is not text or bytes"),
-        (lambda value: encode_ext_value(value, 77), "tea", "'tea' is not bytes"),
+        (values.check_name, "", "at least one"),
+        (values.check_name, "SEVENTEEN_LETTERS", "17 bytes"),
+        *((values.check_name, name, "ASCII") for name in ("GRÖSSE", "A\0B", "A\n", "\x7f")),
+        (values.check_name, b"BYTES", "not bytes"),
+        (values.check_name, None, "not NoneType"),
+        *((values.check_value, each, "parameter") for each in NO_VALUES),
+        (values.check_ext_value, "x" * 129, "129 bytes; an extended parameter holds 128"),
+        (values.check_ext_value, "a\0b", "without NUL"),
+        (values.check_ext_value, "\ud800", "UTF-8"),
+        (values.check_ext_value, None, "not NoneType"),
+        (values.check_ext_value, Decimal("sNaN"), "number in the range of a float"),
+        (lambda value: values.encode_value(value, ParamType.REAL64, BYTEWISE), 0.5, "takes 8 bytes"),
+        (
+            lambda value: values.encode_value(value, ParamType.UINT8, C_CAST),
+            256,
+            "UINT8, which holds 0 to 255",
+        ),
+        (lambda value: values.encode_value(value, 77, C_CAST), 5, "not a type that MAVLink defines"),
+        (lambda value: values.encode_ext_value(value, ParamType.UINT8), "tea", "'tea' is not a number"),
+        (lambda value: values.encode_ext_value(value, ParamType.CUSTOM), 5, "5 is not text or bytes"),
+        (lambda value: values.encode_ext_value(value, 77), "tea", "'tea' is not bytes"),
     ],
 )
 def test_invalid_names_and_values_are_refused(check: Any, argument: Any, words: str) -> None:
@@ -267,8 +254,8 @@ def test_same_bits_compares_numbers_by_value_and_nans_by_bits(a: int, b: int) ->
     for one, other in ((a, b), (a, a), (a, a ^ 0x80000000)):
         first, second = float32(one), float32(other)
         equal = one == other if math.isnan(first) or math.isnan(second) else first == second
-        assert same_bits(ParamType.REAL32, one, other) == equal
-        assert same_bits(ParamType.INT32, one, other) == (one == other)
+        assert values.same_bits(ParamType.REAL32, one, other) == equal
+        assert values.same_bits(ParamType.INT32, one, other) == (one == other)
 
 
 # Text
@@ -289,7 +276,7 @@ def fewest_digits(value: float) -> int:
 @given(patterns)
 def test_format_value_is_the_shortest_round_trip(pattern: int) -> None:
     value = float32(pattern)
-    text = format_value(value)
+    text = values.format_value(value)
     if math.isfinite(value):
         assert struct.pack("<f", float(text)) == struct.pack("<f", value)
         digits = Decimal(text).as_tuple().digits
@@ -314,7 +301,7 @@ def test_format_value_is_the_shortest_round_trip(pattern: int) -> None:
     ],
 )
 def test_format_value(value: Value, kind: ParamType, text: str) -> None:
-    assert format_value(value, kind) == text
+    assert values.format_value(value, kind) == text
 
 
 KINDS = ParamType
@@ -339,20 +326,20 @@ KINDS = ParamType
     ],
 )
 def test_values_of_every_type(number: int, value: Value, raw: bytes) -> None:
-    assert encode_ext_value(value, number) == raw
-    in_message = raw.ljust(EXT_VALUE_SIZE, b"\0")
-    param = ext_param("A", in_message, number, 3)
+    assert values.encode_ext_value(value, number) == raw
+    in_message = raw.ljust(values.EXT_VALUE_SIZE, b"\0")
+    param = values.ext_param("A", in_message, number, 3)
     assert (param.name, param.type, param.index) == ("A", number, 3)
-    assert ext_bytes(param) == encode_ext_value(param.settable, number) == raw
+    assert values.ext_bytes(param) == values.encode_ext_value(param.settable, number) == raw
     assert type(param.settable) is type(value)
     assert param.is_raw == (ParamType(number).name == f"TYPE_{number}")
     assert param.is_raw or param.value == value
-    assert ext_param("A", raw, number, 3) == param
+    assert values.ext_param("A", raw, number, 3) == param
 
 
 @given(st.binary(max_size=128))
 def test_every_custom_value_can_be_set_again(data: bytes) -> None:
-    param = ext_param("A", data.ljust(128, b"\0"), KINDS.CUSTOM)
-    assert encode_ext_value(param.value, KINDS.CUSTOM) == ext_bytes(param) == data.rstrip(b"\0")
+    param = values.ext_param("A", data.ljust(128, b"\0"), KINDS.CUSTOM)
+    assert values.encode_ext_value(param.value, KINDS.CUSTOM) == values.ext_bytes(param) == data.rstrip(b"\0")
     if isinstance(param.value, str):
-        assert check_ext_value(param.value) == param.value
+        assert values.check_ext_value(param.value) == param.value

@@ -95,6 +95,18 @@ async def test_a_stream_resumes_after_the_last_event() -> None:
         problem(answer, 422, "invalid-request")
 
 
+async def test_a_table_has_the_number_of_the_last_event_that_it_includes() -> None:
+    async with browsing(generic()) as browser:
+        before = (await browser.get(f"{V}/params")).json()
+        async with events(browser, f"{before['run']}-{before['seq']}") as stream:
+            await browser.put(f"{V}/params/PARAM_04", json={"value": 9})
+            change = await stream.next("change")
+            assert change["seq"] > before["seq"]
+        after = (await browser.get(f"{V}/params")).json()
+        assert after["seq"] >= change["seq"]
+        assert after["params"]["PARAM_04"]["value"] == 9
+
+
 async def test_a_slow_reader_holds_up_no_other_and_its_stream_is_ended() -> None:
     async with service(generic()) as (hub, browser):
         await synced(browser)

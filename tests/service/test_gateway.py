@@ -33,15 +33,8 @@ from paramclient.service.stations import MavlinkEndpoint, parse_endpoint
 from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, PX4Vehicle, Vehicle
 from paramclient.wire import frames, messages
 from paramclient.wire.messages import (
-    CommandLong,
     FileTransfer,
-    Heartbeat,
     ParamError,
-    ParamExtAck,
-    ParamExtRequestList,
-    ParamExtRequestRead,
-    ParamExtSet,
-    ParamExtValue,
     ParamRequestList,
     ParamRequestRead,
     ParamSet,
@@ -57,7 +50,7 @@ from tests.shell import PeersLink, Radio, Tap, a_client, bits, generic, small_px
 T = TypeVar("T")
 LIST = ParamRequestList(1, 1)
 REQUESTS = (ParamRequestList, ParamRequestRead, ParamSet)
-GCS = Heartbeat(6, 8)
+GCS = messages.Heartbeat(6, 8)
 KEY = SigningKey(bytes(range(32)))
 
 
@@ -112,7 +105,7 @@ async def test_rule_1_frames_pass_and_none_between_stations() -> None:
         second.send(GCS)
         await anyio.sleep(3.0)
         for each in (first, second):
-            assert each.of(Heartbeat, system=1)
+            assert each.of(messages.Heartbeat, system=1)
             assert {frame.system for frame in each.frames} == {1}
         assert {frame.system for _, frame, _ in vehicle.received} == {250, 254, 255}
         assert not vehicle.messages(messages.SetupSigning)  # a key is never passed on
@@ -123,9 +116,15 @@ async def test_rule_1_a_frame_goes_to_the_link_of_its_target() -> None:
     async with gateway_over(*vehicles) as served:
         station = served.partner()
         await served.synced()
-        await station.ask(CommandLong(2, 1, 400), CommandLong(0, 0, 401), CommandLong(9, 1, 402))
+        await station.ask(
+            messages.CommandLong(2, 1, 400), messages.CommandLong(0, 0, 401), messages.CommandLong(9, 1, 402)
+        )
         assert [
-            [each.command for each in vehicle.messages(CommandLong) if each.command in (400, 401, 402)]
+            [
+                each.command
+                for each in vehicle.messages(messages.CommandLong)
+                if each.command in (400, 401, 402)
+            ]
             for vehicle in vehicles
         ] == [[401, 402], [400, 401, 402]]
         await station.ask(ParamSet(0, 1, "PARAM_01", bytes(4), ParamType.INT32), ParamRequestList(0, 0))
@@ -140,12 +139,12 @@ async def test_rule_1_stations_with_equal_ids_send_equal_frames() -> None:
     async with in_sync(small_px4()) as (served, vehicle, station):
         stations = [station, served.partner(), served.partner()]
         for each in stations:
-            each.send(LIST, ParamRequestRead(1, 1, "NONE", -1), CommandLong(1, 1, 400))
+            each.send(LIST, ParamRequestRead(1, 1, "NONE", -1), messages.CommandLong(1, 1, 400))
         await anyio.sleep(3.0)
         for each in stations:
             assert len(each.of(ParamValue)) == 26
             assert len(each.of(ParamError)) == 1
-        assert len(vehicle.messages(CommandLong)) == 1  # the others are equal, and arrive at once
+        assert len(vehicle.messages(messages.CommandLong)) == 1  # the others are equal, and arrive at once
 
 
 async def test_rule_1_a_list_at_the_first_heartbeat_stays_off_the_radio() -> None:
@@ -213,7 +212,7 @@ async def test_rule_2_a_station_that_has_heard_no_heartbeat_hears_one_before_the
     async with in_sync(small_px4()) as (_, _, station):
         await station.ask(LIST, seconds=0.1)
         first, *others = (each for each in station.frames if each.system == 1)
-        assert isinstance(beat := messages.decode(first), Heartbeat)
+        assert isinstance(beat := messages.decode(first), messages.Heartbeat)
         assert (beat.autopilot, len(station.of(ParamValue)), others[0].message_id) == (12, 26, 22)
 
 
@@ -242,25 +241,30 @@ async def test_rule_2_an_unknown_name_is_known_to_be_unknown_in_3_seconds_also_w
 
 async def test_rule_2_extended_parameters() -> None:
     camera = Tap(Camera())
-    wanted = answers_of(Camera(), ParamExtValue, ParamExtRequestList(1, 100))
+    wanted = answers_of(Camera(), messages.ParamExtValue, messages.ParamExtRequestList(1, 100))
     async with gateway_over(camera) as served:
         await served.clients[0].component(1, 100)
         station = served.partner()
-        await station.ask(ParamExtRequestList(1, 100), seconds=5.0)
-        assert station.of(ParamExtValue) == wanted
+        await station.ask(messages.ParamExtRequestList(1, 100), seconds=5.0)
+        assert station.of(messages.ParamExtValue) == wanted
         camera.received.clear()
-        await station.ask(ParamExtRequestList(1, 100))
-        assert station.of(ParamExtValue) == wanted
+        await station.ask(messages.ParamExtRequestList(1, 100))
+        assert station.of(messages.ParamExtValue) == wanted
         one = wanted[2]
-        await station.ask(ParamExtRequestRead(1, 100, one.param_id, -1), ParamExtRequestRead(1, 100, "", 2))
-        assert station.of(ParamExtValue) == [one, one]
-        assert not camera.messages(ParamExtRequestList)
-        new = ParamExtSet(1, 100, "CAM_NAME", b"Rear".ljust(128, b"\0"), ParamType.CUSTOM)
+        await station.ask(
+            messages.ParamExtRequestRead(1, 100, one.param_id, -1),
+            messages.ParamExtRequestRead(1, 100, "", 2),
+        )
+        assert station.of(messages.ParamExtValue) == [one, one]
+        assert not camera.messages(messages.ParamExtRequestList)
+        new = messages.ParamExtSet(1, 100, "CAM_NAME", b"Rear".ljust(128, b"\0"), ParamType.CUSTOM)
         await station.ask(new, new, seconds=3.0)
-        assert station.of(ParamExtAck) == [ParamExtAck("CAM_NAME", new.raw, ParamType.CUSTOM, 0)]
-        wrong = ParamExtSet(1, 100, "CAM_NAME", bytes(128), ParamType.UINT8)
+        assert station.of(messages.ParamExtAck) == [
+            messages.ParamExtAck("CAM_NAME", new.raw, ParamType.CUSTOM, 0)
+        ]
+        wrong = messages.ParamExtSet(1, 100, "CAM_NAME", bytes(128), ParamType.UINT8)
         await station.ask(wrong)
-        assert [each.param_result for each in station.of(ParamExtAck)] == [1]
+        assert [each.param_result for each in station.of(messages.ParamExtAck)] == [1]
 
 
 def direct_file(path: str, size: int) -> bytes:
@@ -400,7 +404,7 @@ async def test_rule_3_the_first_value_of_a_fetch_that_brings_none_is_requested()
     """It comes within 2 s."""
     value = ParamValue("A", bytes(4), ParamType.INT32, 9, 0)
     first = ParamRequestRead(1, 1, "", 0)
-    vehicle = Puppet(lambda message: [value] * (message == first), heartbeat=Heartbeat(2, 3))
+    vehicle = Puppet(lambda message: [value] * (message == first), heartbeat=messages.Heartbeat(2, 3))
     async with gateway_over(vehicle) as served:
         await served.clients[0].component()
         assert await listed(served.partner(), seconds=2.0) == 1
@@ -487,7 +491,7 @@ async def test_rule_3_no_value_is_served_while_its_encoding_is_in_doubt() -> Non
             assert {each.raw for each in station.of(ParamValue)} <= {float_120}
         assert {each.raw for each in vehicle.received if isinstance(each, ParamSet)} <= {float_120}
         for _ in range(6):
-            vehicle.say(Heartbeat(2, 3))
+            vehicle.say(messages.Heartbeat(2, 3))
             await station.ask(LIST, seconds=1.0)
         found = {(each.raw, each.param_index) for each in station.of(ParamValue)}
         assert found == {(float_120, 0), (float_120, 1)}
@@ -756,7 +760,7 @@ async def test_rule_8_answers_are_signed_with_a_link_id_of_their_own() -> None:
         assert len(station.of(ParamValue)) >= 26
         assert len(vehicle.messages(ParamSet)) == 1
         assert not vehicle.messages(ParamRequestList)
-        assert station.of(Heartbeat)
+        assert station.of(messages.Heartbeat)
         assert station.verifier is not None
         report = station.verifier.report()
         assert not report.refused
@@ -792,7 +796,7 @@ async def test_rule_9_the_gateway_is_no_ground_station() -> None:
         await anyio.sleep(3.0)
         vehicle.received.clear()
         await anyio.sleep(3.0)
-        assert {each.type for each in vehicle.messages(Heartbeat)} == {18}
+        assert {each.type for each in vehicle.messages(messages.Heartbeat)} == {18}
         assert {frame.system for _, frame, _ in vehicle.received} == {253}
 
 
@@ -877,7 +881,7 @@ async def test_rule_11_a_loop_ends() -> None:
 async def test_rule_11_neither_an_echo_of_the_radio_nor_a_key_reaches_a_station() -> None:
     radio = Radio(small_px4())
     async with in_sync(radio) as (served, _, station):
-        echo = messages.encode(CommandLong(1, 1, 400), system=9, component=190, sequence=0)
+        echo = messages.encode(messages.CommandLong(1, 1, 400), system=9, component=190, sequence=0)
         key = messages.encode(messages.SetupSigning(1, 1, KEY, 1), system=7, component=1, sequence=0)
         served.partner(system=9).send_bytes(echo)
         await station.ask(GCS)
@@ -897,7 +901,7 @@ async def test_rule_11_a_vehicle_that_moves_is_no_copy_of_itself() -> None:
         await anyio.sleep(12.0)
         station.clear()
         await anyio.sleep(5.0)
-        assert len(station.of(Heartbeat)) >= 4
+        assert len(station.of(messages.Heartbeat)) >= 4
         assert await listed(station) == 26
 
 
@@ -946,14 +950,18 @@ async def test_rule_13_a_readonly_endpoint() -> None:
         mission = frames.build_frame(44, bytes(4), system=255, component=190, sequence=1)
         station.send_bytes(mission)
         await station.ask(
-            set_to("PARAM_01", 33), CommandLong(1, 1, 400), CommandLong(1, 1, 512, 148.0), LIST, GCS
+            set_to("PARAM_01", 33),
+            messages.CommandLong(1, 1, 400),
+            messages.CommandLong(1, 1, 512, 148.0),
+            LIST,
+            GCS,
         )
         assert station.of(ParamError) == [ParamError(255, 190, "PARAM_01", -1, 5)]
         assert by_name(station)["PARAM_01"] == struct.pack("<i", 1)
         await station.ask_file(Opcode.CREATE_FILE, data=b"a.txt")
         await station.ask_file(Opcode.LIST_DIRECTORY, data=b"/")
         commands = [message for _, frame, message in vehicle.received if frame.system == 255]
-        assert commands[:2] == [CommandLong(1, 1, 512, 148.0), GCS]
+        assert commands[:2] == [messages.CommandLong(1, 1, 512, 148.0), GCS]
         files = [Packet.unpack(each.payload).opcode for each in vehicle.messages(FileTransfer)]
         assert files == [Opcode.LIST_DIRECTORY]
 
@@ -1026,6 +1034,7 @@ async def test_the_command_and_the_client_work_through_the_gateway() -> None:
 
         assert "PARAM_01" in await command("fetch", tcp)
         assert "33" in await command("set", tcp, "PARAM_01", "33")
+        assert "33" in await command("get", tcp, "PARAM_01")
         async with a_client(endpoints[1].address.replace("udpin", "udpout")) as client:
             component = await client.component()
             assert bits((await component.fetch_all()).params) == bits(hub.targets[0].component.params)
@@ -1042,7 +1051,7 @@ async def test_a_silent_reset_by_a_station_is_found() -> None:
     async with in_sync(model) as (_, _, station):
         await station.ask(set_to("PARAM_01", 9), seconds=3.0)
         model.load({"PARAM_01": 1})
-        await station.ask(CommandLong(1, 1, 245, 2.0), seconds=3.0)
+        await station.ask(messages.CommandLong(1, 1, 245, 2.0), seconds=3.0)
         assert by_name(station)["PARAM_01"] == struct.pack("<i", 1)
 
 
@@ -1095,7 +1104,9 @@ async def test_a_station_that_floods_and_one_that_sends_garbage() -> None:
             flood.send(*(set_to("MC_PITCH_P", number + each / 64, ParamType.REAL32) for each in range(60)))
             for piece in (noise.randbytes(500), *[b"\xfd" * 500] * stations.NOISE_MAX):
                 garbage.send_bytes(piece)
-            garbage.send(CommandLong(1, 1, 400))  # dropped unread, so that a flood of noise takes no time
+            garbage.send(
+                messages.CommandLong(1, 1, 400)
+            )  # dropped unread, so that a flood of noise takes no time
             await anyio.sleep(0.01)
         assert len(anyio.get_running_tasks()) <= tasks + stations.REQUESTS_MAX + 20
         asked = set_to("MC_ROLL_P", 3, ParamType.REAL32), ParamRequestRead(1, 1, "UNKNOWN", -1)
@@ -1104,9 +1115,22 @@ async def test_a_station_that_floods_and_one_that_sends_garbage() -> None:
         assert by_name(station)["MC_ROLL_P"] == struct.pack("<f", 3)
         assert [each.param_id for each in station.of(ParamError)] == ["UNKNOWN"]
         assert len(requested(vehicle)) < 200
-        assert not vehicle.messages(CommandLong)
+        assert not vehicle.messages(messages.CommandLong)
         assert max(len(each.files) for each in served.gateway.stations) == kept_file.OPEN_FILES_MAX
-        assert station.of(Heartbeat)
+        assert station.of(messages.Heartbeat)
+
+
+async def test_a_station_that_floods_openings_of_the_file_while_the_table_loads() -> None:
+    async with gateway_over(ArduPilotVehicle(ftp_rate=2_000.0)) as served:
+        await served.clients[0].component()
+        flood, station, tasks = served.partner(), served.partner(), len(anyio.get_running_tasks())
+        for number in range(3_000):
+            packet = Packet(number, 0, Opcode.OPEN_FILE_RO, b"@PARAM/param.pck")
+            flood.send(FileTransfer(0, 1, 1, packet.pack()))
+        await anyio.sleep(1.0)
+        assert len(anyio.get_running_tasks()) <= tasks + stations.REQUESTS_MAX + 20
+        [answer] = await station.ask_file(Opcode.OPEN_FILE_RO, data=b"@PARAM/param.pck", seconds=2.9)
+        assert (answer.opcode, answer.code) == (Opcode.NAK, 10)
 
 
 @pytest.mark.asyncio
@@ -1148,7 +1172,7 @@ async def test_memory_stays_flat(monkeypatch: pytest.MonkeyPatch) -> None:
         tracemalloc.start()
         for number in range(8):
             for each in stations:
-                each.send(GCS, LIST, set_to("PARAM_01", number), CommandLong(1, 1, 400, number))
+                each.send(GCS, LIST, set_to("PARAM_01", number), messages.CommandLong(1, 1, 400, number))
                 each.send(*(ParamRequestRead(1, 1, f"N{number}_{name}", -1) for name in range(40)))
             await anyio.sleep(10.0)
             for each in stations:

@@ -16,7 +16,7 @@ from paramclient.model.values import ParamType
 from paramclient.sim import ArduPilotVehicle, Camera, PX4Vehicle
 from tests.recordings import DATA
 from tests.service.hub import V, browsing, problem, service, synced, until, value, vehicle
-from tests.shell import VALUES, FlakyLink, Tap, generic, small_px4
+from tests.shell import VALUES, FlakyLink, PeersLink, Tap, generic, small_px4
 
 CAMERA = "/api/vehicles/1/100"
 EXT = {"ext": "true"}
@@ -144,6 +144,16 @@ async def test_a_vehicle_that_is_lost_answers_no_request_with_a_problem() -> Non
         assert value(await browser.get(f"{V}/params/PARAM_04")) == VALUES["PARAM_04"]
         tap.is_mute = tap.is_deaf = False
         await synced(browser)
+
+
+async def test_two_vehicles_under_one_address_are_not_written() -> None:
+    px4, copter = PX4Vehicle(), ArduPilotVehicle(ftp=False)
+    link = PeersLink({("10.0.0.1", 14550): px4, ("10.0.0.2", 14550): copter})
+    async with service(link, fetches=False) as (_, browser):
+        await until(browser, V, lambda found: found["autopilot"] != "unknown")
+        await asyncio.sleep(2)
+        problem(await browser.put(f"{V}/params/MC_ROLL_P", json={"value": 5}), 409, "ambiguous-vehicle")
+        assert px4.param("MC_ROLL_P").value != 5
 
 
 async def test_an_unexpected_error_is_a_problem_without_details() -> None:

@@ -14,34 +14,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 from pymavlink.generator.mavcrc import x25crc_slow
 
+from paramclient.wire import messages
 from paramclient.wire.frames import BOOT_CLOCK_OFFSETS, Frame, Framer, find_magic, message_name
-from paramclient.wire.messages import (
-    DECODED_IDS,
-    AutopilotVersion,
-    CommandAck,
-    CommandLong,
-    ComponentMetadata,
-    FileTransfer,
-    Heartbeat,
-    HighLatency2,
-    Message,
-    ParamError,
-    ParamExtAck,
-    ParamExtRequestList,
-    ParamExtRequestRead,
-    ParamExtSet,
-    ParamExtValue,
-    ParamRequestList,
-    ParamRequestRead,
-    ParamSet,
-    ParamValue,
-    SetupSigning,
-    StatusText,
-    SystemTime,
-    decode,
-    encode,
-    message_id,
-)
+from paramclient.wire.messages import DECODED_IDS, Message, decode, encode, message_id
 from paramclient.wire.signing import SigningKey
 from tests.recordings import NAMES, read
 
@@ -107,33 +82,35 @@ def take(framer: Framer, chunks: list[bytes]) -> list[Frame]:
 NAME = "SIXTEEN_LETTERS_"
 PACKED_FLOAT = struct.pack("<f", 6.5)
 SENT: list[Message] = [
-    Heartbeat(2, 12, 81, 0x01020304, 4, 3),
-    AutopilotVersion(64495, 0x01110040, b"git hash", 9, 10, 11, 0xFEDCBA9876543210, b"eighteen bytes uid"),
-    CommandLong(1, 2, 512, 148.0, 0.5, 0.0, -1.0, 0.0, 0.0, 3.0, 1),
-    CommandAck(512, 3, 255, 190),
-    ParamRequestRead(1, 2, "MC_ROLL_P"),
-    ParamRequestRead(1, 0, "", 903),
-    ParamRequestList(1, 0),
-    ParamValue("MC_ROLL_P", PACKED_FLOAT, 9, 903, 441),
-    ParamValue(NAME, struct.pack("<f", -0.0), 9, 65535, 65535),
-    ParamValue("", bytes(4), 0, 0, 0),
-    ParamSet(1, 2, NAME, PACKED_FLOAT, 6),
-    StatusText(4, "write denied (A)"),
-    StatusText(6, "x" * 50),
-    ParamError(255, 190, "A", -1, 5),
-    ParamError(0, 0, "", 7, 1),
-    ParamExtRequestRead(1, 100, "CAM_MODE"),
-    ParamExtRequestRead(1, 0, "", 7),
-    ParamExtRequestList(1, 100),
-    ParamExtValue(NAME, bytes(range(1, 129)), 11, 300, 299),
-    ParamExtSet(1, 100, "CAM_MODE", b"\x05".ljust(128, b"\0"), 5),
-    ParamExtAck("CAM_MODE", b"text".ljust(128, b"\0"), 11, 3),
-    SystemTime(2**40 + 1, 2**31 + 2),
-    HighLatency2(2, 12),
-    SetupSigning(1, 2, SigningKey(bytes(range(32))), 2**40 + 3),
-    SetupSigning(1, 2, None, 0),
-    FileTransfer(0, 1, 2, bytes(range(1, 252))),
-    FileTransfer(3, 255, 190, b"\x02" + bytes(250)),
+    messages.Heartbeat(2, 12, 81, 0x01020304, 4, 3),
+    messages.AutopilotVersion(
+        64495, 0x01110040, b"git hash", 9, 10, 11, 0xFEDCBA9876543210, b"eighteen bytes uid"
+    ),
+    messages.CommandLong(1, 2, 512, 148.0, 0.5, 0.0, -1.0, 0.0, 0.0, 3.0, 1),
+    messages.CommandAck(512, 3, 255, 190),
+    messages.ParamRequestRead(1, 2, "MC_ROLL_P"),
+    messages.ParamRequestRead(1, 0, "", 903),
+    messages.ParamRequestList(1, 0),
+    messages.ParamValue("MC_ROLL_P", PACKED_FLOAT, 9, 903, 441),
+    messages.ParamValue(NAME, struct.pack("<f", -0.0), 9, 65535, 65535),
+    messages.ParamValue("", bytes(4), 0, 0, 0),
+    messages.ParamSet(1, 2, NAME, PACKED_FLOAT, 6),
+    messages.StatusText(4, "write denied (A)"),
+    messages.StatusText(6, "x" * 50),
+    messages.ParamError(255, 190, "A", -1, 5),
+    messages.ParamError(0, 0, "", 7, 1),
+    messages.ParamExtRequestRead(1, 100, "CAM_MODE"),
+    messages.ParamExtRequestRead(1, 0, "", 7),
+    messages.ParamExtRequestList(1, 100),
+    messages.ParamExtValue(NAME, bytes(range(1, 129)), 11, 300, 299),
+    messages.ParamExtSet(1, 100, "CAM_MODE", b"\x05".ljust(128, b"\0"), 5),
+    messages.ParamExtAck("CAM_MODE", b"text".ljust(128, b"\0"), 11, 3),
+    messages.SystemTime(2**40 + 1, 2**31 + 2),
+    messages.HighLatency2(2, 12),
+    messages.SetupSigning(1, 2, SigningKey(bytes(range(32))), 2**40 + 3),
+    messages.SetupSigning(1, 2, None, 0),
+    messages.FileTransfer(0, 1, 2, bytes(range(1, 252))),
+    messages.FileTransfer(3, 255, 190, b"\x02" + bytes(250)),
 ]
 RENAMED = {"raw": "param_value", "git_hash": "flight_custom_version", "key": "secret_key"}
 """Fields that have another name here than in the standard."""
@@ -166,8 +143,14 @@ def theirs_of(ours: Message) -> Any:
 
 MESSAGES = [(ours, theirs_of(ours)) for ours in SENT]
 MAVLINK_2_ONLY = (
-    *(ParamError, SetupSigning),
-    *(ParamExtRequestRead, ParamExtRequestList, ParamExtValue, ParamExtSet, ParamExtAck),
+    *(messages.ParamError, messages.SetupSigning),
+    *(
+        messages.ParamExtRequestRead,
+        messages.ParamExtRequestList,
+        messages.ParamExtValue,
+        messages.ParamExtSet,
+        messages.ParamExtAck,
+    ),
 )
 """Messages whose ids are above 255."""
 BEFORE_EXTENSIONS = {"AUTOPILOT_VERSION": 60, "COMMAND_ACK": 3, "STATUSTEXT": 51}
@@ -190,16 +173,16 @@ def test_a_message_that_pymavlink_does_not_have() -> None:
         b"COMPONENT_METADATA uint32_t time_boot_ms uint32_t file_crc char uri " + bytes((100,))
     )
     extra = seed.crc & 0xFF ^ seed.crc >> 8  # as the serialisation page of the guide has it
-    message = ComponentMetadata("mftp://etc/extras/component_general.json.xz", 0x01020304)
+    message = messages.ComponentMetadata("mftp://etc/extras/component_general.json.xz", 0x01020304)
     payload = bytes(4) + b"\x04\x03\x02\x01" + message.uri.encode()
     frame = encode(message, system=7, component=8, sequence=0)
     assert frame == bare_frame(397, payload, extra=extra)
     assert decode(one_frame(frame)) == message
     for longer in (payload.ljust(108, b"\0"), payload.ljust(120, b"\0")):
         assert decode(one_frame(bare_frame(397, longer, extra=extra))) == message
-    longest = ComponentMetadata("mftp://" + "x" * 93, 1)
+    longest = messages.ComponentMetadata("mftp://" + "x" * 93, 1)
     assert decode(one_frame(encode(longest, system=7, component=8, sequence=0))) == longest
-    assert decode(one_frame(bare_frame(397, b"", extra=extra))) == ComponentMetadata("", 0)
+    assert decode(one_frame(bare_frame(397, b"", extra=extra))) == messages.ComponentMetadata("", 0)
 
 
 @pytest.mark.parametrize(("ours", "theirs"), MESSAGES, ids=kind_of)
@@ -226,16 +209,16 @@ def test_a_mavlink_1_frame_is_pymavlinks_without_extension_fields(ours: Message,
 
 
 def test_fields_missing_in_mavlink_1_are_zero() -> None:
-    frame = encode(CommandAck(512, 3, 255, 190), system=1, component=1, sequence=0, version=1)
-    assert decode(one_frame(frame)) == CommandAck(512, 3, 0, 0)
-    version = AutopilotVersion(16, uid=5, uid2=b"eighteen bytes uid")
+    frame = encode(messages.CommandAck(512, 3, 255, 190), system=1, component=1, sequence=0, version=1)
+    assert decode(one_frame(frame)) == messages.CommandAck(512, 3, 0, 0)
+    version = messages.AutopilotVersion(16, uid=5, uid2=b"eighteen bytes uid")
     frame = encode(version, system=1, component=1, sequence=0, version=1)
-    assert decode(one_frame(frame)) == AutopilotVersion(16, uid=5)
+    assert decode(one_frame(frame)) == messages.AutopilotVersion(16, uid=5)
 
 
 def test_an_id_above_255_has_no_mavlink_1_frame() -> None:
     with pytest.raises(ValueError, match="range"):
-        encode(ParamError(1, 1, "A", -1, 5), system=1, component=1, sequence=0, version=1)
+        encode(messages.ParamError(1, 1, "A", -1, 5), system=1, component=1, sequence=0, version=1)
 
 
 @pytest.mark.parametrize(("ours", "theirs"), MESSAGES, ids=kind_of)
@@ -253,7 +236,7 @@ def test_a_payload_may_be_longer_or_shorter_than_known(ours: Message, theirs: An
 def test_a_name_ends_at_its_first_nul_and_keeps_odd_bytes() -> None:
     payload = bytes(4) + b"\x01\0\x02\0" + b"A\xff\0GARBAGE".ljust(16, b"!") + b"\x06"
     value = decode(one_frame(bare_frame(22, payload)))
-    assert value == ParamValue("A\xff", bytes(4), 6, 1, 2)
+    assert value == messages.ParamValue("A\xff", bytes(4), 6, 1, 2)
     assert encode(value, system=7, component=8, sequence=0)[18:21] == b"A\xff\0"
 
 
@@ -307,7 +290,7 @@ def test_a_recording_gives_the_frames_that_pymavlink_finds(name: str) -> None:
     values = [decode(frame) for frame in Framer({22}).receive(stream)]
     theirs = [m for m in dialect.MAVLink(None).parse_buffer(stream) if m.get_type() == "PARAM_VALUE"]
     for ours, message in zip(values, theirs, strict=True):
-        assert isinstance(ours, ParamValue)
+        assert isinstance(ours, messages.ParamValue)
         assert ours.raw == bytes(message.get_msgbuf()[10:14])
         assert ours[:1] + ours[2:] == (
             message.param_id,
