@@ -69,7 +69,8 @@ class ListResult:
         lost: values of the list that were lost, and read one by one or by another list.
         repeated: values received more than once.
         digest: PX4's, which begins its list; it is of the table at that moment.
-        has_gap: whether values between the first and the last received one are missing.
+        has_gap: whether values between the first and the last received one are missing, and reads of them
+            would not have been answered.
     """
 
     missing: list[int] = field(default_factory=list)
@@ -179,10 +180,12 @@ class _Download:
             before = len(self._received)
             await self._next_pass()
             left -= len(self._received) == before
-        if not has_loss and not self.channel.is_silent(self._began):
+        is_silent = self.channel.is_silent(self._began)
+        if not has_loss and not is_silent:
             self.table.end_list()
         self.result.missing = missing = self._missing()
-        self.result.has_gap = any(min(self._received) < each < self._reached for each in missing)
+        if is_silent or not serves_reads:
+            self.result.has_gap = any(min(self._received) < each < self._reached for each in missing)
         self.result.lost = len(self._lost & {*self._received, *missing})
 
     async def _take_passes(self) -> None:

@@ -25,7 +25,7 @@ class Partial(Puppet):
     Args:
         table: values and types, by name.
         serves: of `EVERYTHING`.
-        first: the first index.
+        first, step: the first index, and the interval between two.
         count: returns the param_count of an index.
         encoding: of the values.
         ack_type: the type in acknowledgements; None for the parameter's.
@@ -41,6 +41,7 @@ class Partial(Puppet):
         *,
         serves: Iterable[str] = EVERYTHING,
         first: int = 0,
+        step: int = 1,
         count: Callable[[int], int] | None = None,
         encoding: Encoding = Encoding.BYTEWISE,
         ack_type: ParamType | None = None,
@@ -53,7 +54,7 @@ class Partial(Puppet):
         self.values = {name: encode_value(value, kind, encoding) for name, (value, kind) in table.items()}
         self.types = {name: kind for name, (_, kind) in table.items()}
         self._serves = frozenset(serves)
-        self._first = first
+        self._indices = {name: first + step * place for place, name in enumerate(table)}
         self._count = count or (lambda index: len(table))
         self._ack_type = ack_type
         self._on_set = on_set
@@ -65,7 +66,7 @@ class Partial(Puppet):
         return sum(isinstance(each, kind) for each in self.received)
 
     def _value(self, name: str, kind: ParamType | None = None) -> messages.ParamValue:
-        index = self._first + list(self.values).index(name)
+        index = self._indices[name]
         kind = self.types[name] if kind is None else kind
         return messages.ParamValue(name, self.values[name], kind, self._count(index), index)
 
@@ -79,7 +80,7 @@ class Partial(Puppet):
             case messages.ParamRequestList() if "list" in self._serves:
                 yield from map(self._value, self.values)
             case messages.ParamRequestRead(param_index=index, param_id=name):
-                by_index = dict(enumerate(self.values, self._first)) if "indices" in self._serves else {}
+                by_index = {at: each for each, at in self._indices.items() if "indices" in self._serves}
                 name = by_index.get(index, "") if index >= 0 else name if "names" in self._serves else ""
                 if name in self.values:
                     yield self._value(name)
