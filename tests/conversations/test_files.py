@@ -19,7 +19,8 @@ from paramclient.protocol.param_pck import PackedParam, encode
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire.messages import FileTransfer, Message, ParamValue
 from paramclient.wire.messages import encode as frame
-from tests.conversations.virtual import Silence, Tap, losing, talking, virtual_on_both
+from tests.conversations.virtual import Silence, Tap, losing, meanwhile, talking, virtual_on_both
+from tests.shell import bits
 
 BOTH = pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
 Maker = type[PX4Vehicle] | type[ArduPilotVehicle]
@@ -292,24 +293,20 @@ async def test_a_lost_block_of_a_file_that_has_moved_meanwhile_is_not_put_into_i
     async with talking(Tap(vehicle, up=moves, down=losing(1, is_lost))) as (_, session):
         result = await fetch_all(session)
         assert result.source == "ftp"
-        assert {each.name: each.bits for each in vehicle.listed} == {
-            each.name: each.bits for each in result.params.values()
-        }
+        assert bits(result.params) == bits(vehicle.params)
 
 
 async def test_a_file_of_a_table_that_changes_meanwhile_is_right_in_the_end() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     async with talking(Air.symmetric([vehicle], delay=0.02)) as (_, session):
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(fetch_all, session)
+        async with meanwhile(fetch_all(session)):
             await anyio.sleep(0.3)
             vehicle.set_param("EK2_ENABLE", 1)
             vehicle.set_param("RTL_ALT", 4321)
         assert session.table.params["RTL_ALT"].value == 4321
         result = await fetch_all(session)
-        assert {name: each.bits for name, each in vehicle.params.items()} == {
-            name: each.bits for name, each in result.params.items() if each.index is not None
-        }
+        listed = {name: each for name, each in result.params.items() if each.index is not None}
+        assert bits(listed) == bits(vehicle.params)
 
 
 @pytest.mark.parametrize("rate", [4_500.0, 2_000.0])

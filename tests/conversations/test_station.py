@@ -23,6 +23,7 @@ from paramclient.wire import messages
 from paramclient.wire.frames import build_frame
 from paramclient.wire.signing import Refusal, Signer, SigningKey, Verifier
 from tests.conversations.virtual import Puppet, converse, messages_in, talking, virtual_on_both
+from tests.shell import bits
 
 PX4 = messages.Heartbeat(2, 12, system_status=4)
 ARDUPILOT = messages.Heartbeat(10, 3, system_status=4)
@@ -351,9 +352,7 @@ async def test_a_whole_session_in_mavlink_1(make: type[Vehicle]) -> None:
         await session.identification.settled()
         conversation.sent.clear()
         result = await fetch_all(session)
-        assert {name: each.bits for name, each in result.params.items()} == {
-            name: each.bits for name, each in vehicle.params.items()
-        }
+        assert bits(result.params) == bits(vehicle.params)
         assert {
             data[0] for data in conversation.sent if not isinstance(messages_in(data)[0], messages.Heartbeat)
         } == {0xFE}
