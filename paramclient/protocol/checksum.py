@@ -157,6 +157,7 @@ class _Proof:
         often = {at for at, row in enumerate(rows) if row.name in volatile} - always - seconds
         rare = {at for at, row in enumerate(rows) if row.name == BOOT_COUNT or may_be_rounded(row)}
         suspects: set[int] = set()
+        may_repeat = bool(always)
         numbers = {len(whole)} | (self._ends_of(always, whole) or ({1} if self._is_slow else set()))
         await self._request(numbers)  # the first rows show whether the count in the header is another
         while places := self._places():
@@ -181,7 +182,11 @@ class _Proof:
                     raise TableDiffers(OTHER)
                 else:
                     return False
-            self._weigh(len(guesses), len(numbers), divided)
+            answered = [self._times[number][1] for number in self._found]
+            if may_repeat and numbers and max(answered) - min(answered) > OUTDATED:
+                numbers, may_repeat = set(self._found), False  # a pressure may have moved in between
+            else:
+                self._weigh(len(guesses), len(numbers), divided)
             if numbers:
                 numbers |= self._forget_outdated(places)
                 await self._request(numbers | self._ends_of(always, whole))

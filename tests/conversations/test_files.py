@@ -277,9 +277,7 @@ async def test_a_lost_opening_of_the_file_is_repeated_before_the_list_is_taken()
 
 
 @pytest.mark.parametrize(("name", "block"), [("RELAY1_FUNCTION", 3), ("SIM_MAG2_OFS_X", 27)])
-async def test_a_lost_block_of_a_file_that_has_moved_meanwhile_is_not_put_into_it(
-    name: str, block: int
-) -> None:
+async def test_a_lost_block_of_a_file_that_has_moved_is_not_put_into_it(name: str, block: int) -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
 
     def is_lost(message: Message) -> bool:

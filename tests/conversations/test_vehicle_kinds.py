@@ -217,9 +217,7 @@ async def test_a_name_that_an_ardupilot_without_reads_does_not_list_is_unknown(
 
 @pytest.mark.parametrize("step", [1, 2])
 @pytest.mark.parametrize("serves", [EVERYTHING, ("list", "indices")], ids=["all reads", "by index"])
-async def test_an_unknown_name_of_a_px4_without_hash_is_told_as_what_it_is(
-    serves: tuple[str, ...], step: int
-) -> None:
+async def test_an_unknown_name_of_a_px4_without_hash_is_unknown(serves: tuple[str, ...], step: int) -> None:
     vehicle = Partial(serves=serves, step=step, heartbeat=PX4, count=lambda index: len(TABLE) + 2)
     async with talking(vehicle) as (_, session):
         with pytest.raises(errors.UnknownParameter) as caught:
