@@ -11,6 +11,7 @@ from paramclient.model.px4_hash import find_volatile, hash_bits
 from paramclient.model.values import (
     Encoding,
     Param,
+    ParamType,
     Trust,
     as_reported,
     encoding_of,
@@ -120,7 +121,8 @@ class Table:
     def encoding(self) -> Encoding:
         """How the component encodes values; a change decodes all received values again.
 
-        Later than `report_held`, a change is against all evidence: the values are forgotten.
+        Later than `report_held`, as by a heartbeat that comes late, the received values are forgotten. Those
+        from the cache stay, and floats, which are the same in both.
         """
         return self._encoding
 
@@ -130,7 +132,8 @@ class Table:
             return
         self._encoding = encoding
         if self._held is None:
-            self.clear()
+            received = {name: each for name, each in self.params.items() if each.trust is not Trust.CACHED}
+            self._forget(name for name, each in received.items() if each.type is not ParamType.REAL32)
         for name, (raw, number) in self._wire.items():
             old = self.params[name]
             new = self.dialect.param(name, raw, number, old.index, encoding)
@@ -406,7 +409,10 @@ class Table:
         only now. A table that the vehicle has confirmed stays."""
         if any(param.trust is Trust.VERIFIED for param in self.params.values()):
             return
-        for name in [name for name, param in self.params.items() if param.trust is Trust.CACHED]:
+        self._forget(name for name, param in self.params.items() if param.trust is Trust.CACHED)
+
+    def _forget(self, names: Iterable[str]) -> None:
+        for name in list(names):
             index = self._drop(name).index
             if index is not None and self.names.get(index) == name:
                 del self.names[index]

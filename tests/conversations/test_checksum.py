@@ -401,18 +401,20 @@ async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None
         check(vehicle, node, result)
 
 
+@pytest.mark.parametrize("late", [0.0, 2.0])
 @virtual
-async def test_a_cached_table_is_proven_where_the_first_heartbeat_comes_behind_the_version() -> None:
+async def test_a_cached_table_is_proven_where_the_first_heartbeat_is_behind_the_version(late: float) -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     cached = vehicle.params
 
     def passes(message: Message) -> bool:
-        return not isinstance(message, Heartbeat) or anyio.current_time() > 0.9
+        return not isinstance(message, Heartbeat) or anyio.current_time() > 0.9 + late
 
     async with converse(Tap(vehicle, down=passes)) as conversation:
         value = cached["ATC_RAT_RLL_P"].bits.to_bytes(4, "little")
         conversation.hear(ParamValue("ATC_RAT_RLL_P", value, ParamType.REAL32, len(vehicle.listed), NO_INDEX))
         node = await with_cached_table(conversation, cached)
+        await anyio.sleep(late)
         assert node.identification.autopilot is None
         result = await fetch_all(node.plain)
         assert (result.source, result.notes) == ("cache", ())
