@@ -1,6 +1,6 @@
 """Frames per second from bytes to messages: this library compared with pymavlink's `parse_buffer`.
 
-    python bench/parse.py [FRAMES [SECONDS]]
+    python bench/parse.py [--frames N] [--seconds N]
 
 Both parsers get the same stream in every run: 10 % PARAM_VALUE, and other messages in the proportions of a
 PX4 vehicle's telemetry. Both get it in one call. pymavlink is set up as in a program without a signing key:
@@ -11,6 +11,7 @@ same PARAM_VALUEs.
 
 from __future__ import annotations
 
+import argparse
 import gc
 import random
 import struct
@@ -60,8 +61,11 @@ Messages = list[Any]
 
 
 def main() -> None:
-    frames = int(sys.argv[1]) if len(sys.argv) > 1 else FRAMES
-    seconds = float(sys.argv[2]) if len(sys.argv) > 2 else SECONDS
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--frames", type=int, default=FRAMES)
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="of each round")
+    options = parser.parse_args()
+    frames, seconds = options.frames, options.seconds
     stream = build_stream(frames, random.Random(SEED))
     print(f"{frames:,} frames, {len(stream):,} bytes; {ROUNDS} rounds of {seconds} s each")
 
