@@ -319,7 +319,8 @@ class SqliteStore(Store):
         self._is_read_only = not writing and _is_unwritable(connection)
         if self._is_read_only:
             connection.close()
-            if Path(f"{self._path}-wal").exists():
+            wal = Path(f"{self._path}-wal")
+            if wal.exists() and wal.stat().st_size:  # a full disk leaves an empty one
                 self._warn(_WITHOUT_WAL.format(self.place))
             return _connect(f"{self._path.as_uri()}?mode=ro&immutable=1")
         connection.execute("PRAGMA foreign_keys = ON")

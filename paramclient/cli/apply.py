@@ -183,6 +183,8 @@ async def _from_file(
         file = source or (read_source(path) if is_file(path) else None)
         if file is None:
             raise errors.FileError("no such file", source=path)
+        if file.left_out and not partial:
+            raise errors.FileError("nothing was sent; --partial writes what can be read", source=file.source)
         params = choose(file, session.choice.component, session.component.system)
         own, origin = session.component.identity, params.identity
         has_uid = origin is not None and origin.uid is not None

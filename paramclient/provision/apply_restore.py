@@ -94,7 +94,7 @@ async def restore_categories(component: Component, state: ParamSet) -> tuple[str
     """
     await wait_for_identity(component)
     origin, own = state.identity, component.identity
-    is_own = origin is not None and origin.is_same_vehicle(own)
+    is_own = origin is not None and origin.uid == own.uid and origin.is_same_vehicle(own)
     if origin is not None and not is_own and None not in (origin.uid, own.uid) and origin.uid != own.uid:
         raise UsageError(f"the state is that of another vehicle: {origin}; this vehicle is {own}")
     return OWN_STATE_CATEGORIES if is_own else (OUT_OF_RANGE,)

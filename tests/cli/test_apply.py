@@ -84,14 +84,15 @@ def test_apply_sets_and_verifies_values_that_differ(command: Command, put: Put, 
 
 
 @pytest.mark.parametrize("name", ["quad.param", "{system}.param"])
-def test_a_name_that_no_vehicle_can_have_is_skipped_and_named(
+def test_a_name_of_no_vehicle_is_skipped_by_partial(
     command: Command, put: Put, file: File, name: str
 ) -> None:
     vehicle = copter()
     wrong = file("RTL_ALT,2500\nSIM_GPS1_BYTELOSS,0\n", name.format(system=1))
-    outcome = command("apply", put(vehicle), wrong.with_name(name))
-    assert (outcome.code, vehicle.values["RTL_ALT"]) == (1, 2500)
-    assert "line 2: " in outcome.err
+    for options, code, value in (((), 2, 1500), (("--partial",), 1, 2500)):
+        outcome = command("apply", put(vehicle), wrong.with_name(name), *options)
+        assert (outcome.code, vehicle.values["RTL_ALT"]) == (code, value)
+        assert "line 2: " in outcome.err
 
 
 @pytest.mark.parametrize(
