@@ -84,9 +84,7 @@ def test_apply_sets_and_verifies_values_that_differ(command: Command, put: Put, 
 
 
 @pytest.mark.parametrize("name", ["quad.param", "{system}.param"])
-def test_a_name_of_no_vehicle_is_skipped_by_partial(
-    command: Command, put: Put, file: File, name: str
-) -> None:
+def test_an_impossible_name_is_skipped_by_partial(command: Command, put: Put, file: File, name: str) -> None:
     vehicle = copter()
     wrong = file("RTL_ALT,2500\nSIM_GPS1_BYTELOSS,0\n", name.format(system=1))
     for options, code, value in (((), 2, 1500), (("--partial",), 1, 2500)):
