@@ -90,10 +90,8 @@ def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
             data = file.read(most)
     except OSError as error:
         raise UsageError(f"{os.fspath(path)}: the {what} cannot be read: {error.strerror}") from error
-    if sys.platform != "win32" and status.st_uid not in (
-        os.geteuid(),
-        0,
-    ):  # it has neither such ids nor modes
+    # Windows has neither such ids nor such modes
+    if sys.platform != "win32" and status.st_uid not in (os.geteuid(), 0):
         raise UsageError(
             f"{os.fspath(path)}: this {what} belongs to another user (id {status.st_uid}), who can change it;"
             " `chown` it to the user of this program"

@@ -60,10 +60,7 @@ async def download_file(session: Session) -> int:
         except PackError as error:
             reason = f"is not valid: {error}"
         else:
-            reason = await _contradiction(session, pack, count)
-            expected = encode(pack.entries, with_defaults=pack.with_defaults)
-            if not reason and vehicle.is_ardupilot and expected != data:
-                reason = "is a mixture of two tables"
+            reason = await _contradiction(session, pack, data, count)
         if not reason:
             session.serves_file, session.ftp_unanswered = True, 0
             _store(session, pack, requested_at)
@@ -72,16 +69,19 @@ async def download_file(session: Session) -> int:
     raise FileUnavailable(f"the parameter file {reason}")
 
 
-async def _contradiction(session: Session, pack: Pack, count: int | None) -> str:
+async def _contradiction(session: Session, pack: Pack, data: bytes, count: int | None) -> str:
     """Return why a file cannot be the vehicle's whole table, or "".
 
-    `count`: that of the vehicle, as read beside the file; None where it was not.
+    `data` is the file, and `count` that of the vehicle, as read beside it; None where it was not.
     """
     if not pack.entries or len(pack.entries) != pack.total:
         return f"has {len(pack.entries)} of {pack.total} parameters"
     known = session.table.count
     if pack.total not in (known or pack.total, count) and await _count(session) != pack.total:
         return f"has {pack.total} parameters, and the cached table {known}"
+    is_ardupilot = session.identification.is_ardupilot  # others may pad it in another way
+    if is_ardupilot and data != encode(pack.entries, with_defaults=pack.with_defaults):
+        return "is a mixture of two tables"
     return ""
 
 
