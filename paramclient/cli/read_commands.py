@@ -72,11 +72,9 @@ async def fetch(
                     from paramclient.provision.sources import NO_DEFAULTS  # only here: loads provision
 
                     raise VehicleError(NO_DEFAULTS, *session.component.address)
-                table = ParamMap({each.name: each for each in params})
-                differing = table.changed(defaults_in(known, table))
+                differing = ParamMap({each.name: each for each in params}).changed(defaults_in(known, given))
                 params = [each for each in params if each.name in differing]
-                if not options.json:
-                    say_sources(session.label, [given[each.name] for each in params])
+                say_sources(session.label, [given[each.name] for each in params])
             columns = ("name", "value", "type", "index", "trust", *(["default"] if changed else []))
             item = fetch_json(session.component, result, params, known) | _errors_json(errors)
             return _Shown(item, columns, partial(_report_fetch, session, result, errors.values()))

@@ -149,7 +149,9 @@ class CommandSession:
     @property
     def prefix(self) -> str:
         """The beginning of a line about the component: its label if it may be one of several, else ""."""
-        return f"{self.label}: " if self.choice.is_all or self.others else ""
+        writer, is_named = self.client.core.cache_writer, self.options.vehicle is not None
+        others = self.others or (not is_named and writer.knows_another(self.component.node))
+        return f"{self.label}: " if self.choice.is_all or others else ""
 
     @property
     def receiver(self) -> str:
@@ -251,7 +253,8 @@ class Sessions(list[CommandSession]):
     def show(self, results: Mapping[CommandSession, Shown]) -> int:
         """Print results as one table or as JSON, then remarks and failures; return the exit code.
 
-        If several vehicles are heard, and none was named, the table says which one it shows.
+        If none was named, and several are heard or the cache has others of the link, the table says which
+        vehicle it shows.
         """
         self.report_others()
         found = results.items()

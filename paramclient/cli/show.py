@@ -77,7 +77,9 @@ async def show(
         return ExitCode.DONE
     for (shown, known, defaults), item in zip(views, items, strict=True):
         columns = ("name", "value", "default", "type", "meaning", "units", "comment")
-        print_table(columns, cells_of(item["params"], *columns[1:]))
+        vehicle = address(shown) if len(items) > 1 else None
+        rows = ([vehicle, *cells] for cells in cells_of(item["params"], *columns[1:]))
+        print_table(["vehicle", *columns], rows)
         for name in shown if chosen and known is not None else ():
             _print_description(name, info_of(known, name))
         say(described(shown) + (", those that differ from their default" if changed else ""))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from functools import partial as bind
 from pathlib import Path
@@ -251,10 +251,10 @@ async def diff(
     if options.json:
         print_json(found)
     else:
-        _print(found)
-        for side, params in (("left", first), ("right", second), ("base", before)):
-            if params is not None:
-                say(f"{side}: {described(params)}")
+        sides = {"left": first, "right": second} | ({} if before is None else {"base": before})
+        _print(found, sides)
+        for side, params in sides.items():
+            say(f"{side}: {described(params)}")
         say(_summary(found))
         has_more = any(number for kind, number in found["counts"].items() if kind.startswith("only"))
         if has_more and not partial and sources.is_file(left) != sources.is_file(right):
@@ -262,8 +262,8 @@ async def diff(
     return ExitCode.DONE if outcome.is_same else ExitCode.INCOMPLETE
 
 
-def _print(found: JsonObject) -> None:
-    """Print the entries that differ."""
+def _print(found: JsonObject, sides: Mapping[str, ParamSet]) -> None:
+    """Print the entries that differ, below the sides with the addresses of their vehicles, if known."""
     rows = []
     for name, entry in found["params"].items():
         side, words = entry["changed_side"], [entry["is"]]
@@ -271,11 +271,12 @@ def _print(found: JsonObject) -> None:
             words.append(f"{entry['left']['type']} and {entry['right']['type']}")
         if entry["rounding"]:
             words.append("the same as float32")
-        values = [_shown(entry[each]) for each in ("left", "right", "base")]
+        values = [_shown(entry[each]) for each in sides]
         changed = None if found["base"] is None else side or "unknown"
         rows.append([name, *values, entry.get("units"), ", ".join(words), changed])
     if rows:
-        print_table(["name", "left", "right", "base", "units", "is", "changed"], rows)
+        heads = (f"{side} {address(each)}" if each.system else side for side, each in sides.items())
+        print_table(["name", *heads, "units", "is", "changed"], rows)
 
 
 def _shown(side: JsonObject | None) -> object:

@@ -80,7 +80,7 @@ def test_diff_prints_a_table_of_differences(command: Command) -> None:
     outcome = command("diff", 1, 2)
     assert outcome.code == 1
     assert outcome.rows == [
-        ["name", "left", "right", "is"],
+        ["name", "left 1/1", "right 2/1", "is"],
         ["B_FLOAT", "0.1", "0.2", "different"],
         ["C_LEFT", "5", "only left"],
         ["D_RIGHT", "6", "only right"],
@@ -98,7 +98,7 @@ def test_diff_prints_a_table_of_differences(command: Command) -> None:
 def test_a_base_shows_the_side_that_has_changed(command: Command, cache: Path) -> None:
     keep(cache, {"B_FLOAT": (0.1, REAL32), "F_CONFLICT": (0.5, REAL32)}, THIRD)
     outcome = command("diff", 1, 2, "--base", 3)
-    assert outcome.rows[0] == ["name", "left", "right", "base", "is", "changed"]
+    assert outcome.rows[0] == ["name", "left 1/1", "right 2/1", "base 3/1", "is", "changed"]
     assert {row[0]: row[1:] for row in outcome.rows[1:]} == {
         "B_FLOAT": ["0.1", "0.2", "0.1", "different", "right"],
         "C_LEFT": ["5", "only left", "unknown"],
