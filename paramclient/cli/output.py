@@ -42,7 +42,7 @@ SENTENCE_WIDTH_MIN: Final = 20
 _STYLES: Final = {
     **dict.fromkeys(("set", "accepted", "only right"), "32"),
     **dict.fromkeys(("later", "adjusted", "unproven", "different", "slow"), "33"),
-    **dict.fromkeys(("refused", "invalid", "unknown", "only left", "conflict", "problem"), "31"),
+    **dict.fromkeys(("refused", "unknown", "only left", "conflict", "problem"), "31"),
     **dict.fromkeys(("skipped", "not tried"), "2"),
 }
 """Codes of the styles of outcomes, differences and findings on a terminal: green, yellow, red and dim."""

@@ -425,7 +425,7 @@ class _Run:
             is_there = known.system == system != component.system and known.state != "lost"
             if is_there and not is_ours:
                 reason = f"another vehicle on this link has system id {system}"
-                self._settle(row, ApplyStatus.SKIPPED, reason, WRONG)
+                self._settle(row, ApplyStatus.REFUSED, reason, WRONG)
                 return
         if row.needs_reboot:
             await self._write([row])
@@ -545,8 +545,10 @@ class _Run:
             unread, answered = ApplyStatus.UNPROVEN, "acknowledged"
         if is_sent and planned.before is None:
             return replace(row(unread, f"{answered}, and the vehicle no longer reports it"), nearest=())
+        if planned.status is ApplyStatus.LATER:
+            return row(ApplyStatus.NOT_TRIED, planned.reason, planned.category)
         if planned.status is not ApplyStatus.SET:
-            return row(ApplyStatus.SKIPPED, planned.reason, planned.category)
+            return row(planned.status, planned.reason, planned.category)
         if not is_sent:
             return row(ApplyStatus.NOT_TRIED, "not reached")
         if self._inspected_at < self._written_at:

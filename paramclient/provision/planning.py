@@ -21,7 +21,7 @@ from paramclient.model.names import is_group_switch, nearest_names
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, Value, format_value
 from paramclient.protocol.dialect import EXTENDED, PLAIN
-from paramclient.provision.apply_rules import ACTION, CATEGORIES, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
+from paramclient.provision.apply_rules import ACTION, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
 
 MISSING: Final = "missing"
 """The category of a parameter that the vehicle does not have."""
@@ -54,18 +54,16 @@ class ApplyStatus(StrEnum):
     LATER = "later"
     """Planned: the vehicle does not have the parameter now; a step of the plan may reveal it, going by its
     name, and then it is set."""
-    INVALID = "invalid"
-    """Planned: the value is invalid; `reason` says why."""
     ACCEPTED = "accepted"
     """The value was written, and read back at the end."""
     ADJUSTED = "adjusted"
     """The value was written, and the vehicle changed it, immediately or within a second."""
     REFUSED = "refused"
-    """The vehicle refused the value."""
+    """Also planned: the vehicle refused the value or lacks the parameter, or the value cannot be sent."""
     UNCHANGED = "unchanged"
     """The vehicle has the value already."""
     SKIPPED = "skipped"
-    """Not written: left out, not on this vehicle, or invalid; `reason` says why."""
+    """Also planned: left out on purpose; `reason` says why."""
     UNPROVEN = "unproven"
     """The value was acknowledged, and could not be read back at the end."""
     UNKNOWN = "unknown"
@@ -84,7 +82,7 @@ class ApplyRow:
         before: the value before `apply`, or None if the vehicle did not have the parameter.
         actual: the value that the vehicle last sent, or None; None in a plan.
         type: the vehicle's type of the parameter; None if unknown.
-        category: for skipped and invalid parameters, the kind of reason: one of `CATEGORIES`, "action",
+        category: for skipped and refused parameters, the kind of reason: one of `CATEGORIES`, "action",
             `MISSING`, or `WRONG`; else "".
         reason: the reason for the status as a sentence; may be "".
         nearest: for a parameter that the vehicle does not have, the most similar names, most similar first.
@@ -114,9 +112,7 @@ class ApplyRow:
     @property
     def is_as_wanted(self) -> bool:
         """Whether the vehicle has the wanted value, or the parameter is left out on purpose."""
-        if self.status is ApplyStatus.SKIPPED:
-            return self.category in _INTENDED_CATEGORIES
-        return self.status in (ApplyStatus.ACCEPTED, ApplyStatus.UNCHANGED)
+        return self.status in (ApplyStatus.ACCEPTED, ApplyStatus.UNCHANGED, ApplyStatus.SKIPPED)
 
     @property
     def is_shown(self) -> bool:
@@ -330,12 +326,8 @@ class _Planner:
             problems={
                 name: row.why
                 for name, row in rows.items()
-                if row.status is ApplyStatus.INVALID
-                or (
-                    row.status is ApplyStatus.SKIPPED
-                    and row.category == MISSING
-                    and not name.startswith(hidden)
-                )
+                if row.status is ApplyStatus.REFUSED
+                and not (row.category == MISSING and name.startswith(hidden))
             },
             extra=tuple(name for name in self.current if name not in self.wanted),
             unchecked=tuple(name for name, row in rows.items() if self.is_unchecked(row)),
@@ -368,7 +360,7 @@ class _Planner:
         if rule is not None and (rule.category == ACTION or not self.choice.has(name, rule.category)):
             return verdict(ApplyStatus.SKIPPED, rule.category, f"left out: it {rule.reason}")
         if before is None:
-            return verdict(ApplyStatus.SKIPPED, MISSING, "not on this vehicle")
+            return verdict(ApplyStatus.REFUSED, MISSING, "not on this vehicle")
         if _is_same(wanted.settable, before, kind):
             return verdict(ApplyStatus.UNCHANGED)
         if info is not None and info.is_read_only and not self.choice.has(name, READ_ONLY):
@@ -376,7 +368,7 @@ class _Planner:
         wrong = self._find_fault(wanted, before, kind)
         if wrong is None or (wrong[0] == OUT_OF_RANGE and self.choice.has(name, OUT_OF_RANGE)):
             return verdict(ApplyStatus.SET)
-        return verdict(ApplyStatus.INVALID, *wrong)
+        return verdict(ApplyStatus.REFUSED, *wrong)
 
     def stages(self, rows: Mapping[str, ApplyRow]) -> tuple[Stage, ...]:
         """Return the stages, in order; in the last one, the system id is last."""
@@ -490,8 +482,6 @@ def _is_same(wanted: Value, current: Value, kind: ParamType | int | None) -> boo
     return same_value(*(WrittenParam("", value, kind) for value in (wanted, current)))
 
 
-_INTENDED_CATEGORIES: Final = frozenset({*CATEGORIES, ACTION}) - {OUT_OF_RANGE}
-"""Categories of parameters that are left out on purpose: a skipped row of one is no failure."""
 _PURPOSES: Final = (
     "frame parameters",
     "switches that reveal parameters",

@@ -338,7 +338,7 @@ async def test_a_system_id_of_another_vehicle_is_not_set() -> None:
         component = await client.component(1, 1)
         await client.component(7, 1)
         result = await apply(component, {"SYSID_THISMAV": 7}, include="identity")
-    assert statuses(result) == {"SYSID_THISMAV": "skipped"}
+    assert statuses(result) == {"SYSID_THISMAV": "refused"}
     assert "another vehicle on this link" in result.rows["SYSID_THISMAV"].reason
     assert not result.complete
     assert [vehicle.system for vehicle in vehicles] == [1, 7]

@@ -60,13 +60,13 @@ def test_every_wanted_parameter_gets_a_status() -> None:
         "ROLL_P = 4, unchanged",
         "PITCH_P 4.0 -> 6.5, set",
         "STAT_RUNTIME 5 -> 6, skipped: left out: it is counted by the vehicle itself",
-        "COUNT 1 -> 300, invalid: 300 does not fit INT8, which holds -128 to 127",
-        "PICTH_P = 1, skipped: not on this vehicle",
+        "COUNT 1 -> 300, refused: 300 does not fit INT8, which holds -128 to 127",
+        "PICTH_P = 1, refused: not on this vehicle",
     ]
     (row,) = made.to_write
     assert (row.name, row.wanted.settable, row.type, row.before) == ("PITCH_P", 6.5, ParamType.REAL32, 4.0)
     assert (made.extra, made.complete, set(made.problems)) == (("OTHER",), False, {"COUNT", "PICTH_P"})
-    assert repr(made) == "<Plan 1 set, 1 invalid, 1 unchanged, 2 skipped in 1 stages>"
+    assert repr(made) == "<Plan 1 set, 2 refused, 1 unchanged, 1 skipped in 1 stages>"
 
 
 def test_a_mistyped_name_gets_the_nearest_names() -> None:
@@ -184,7 +184,7 @@ def test_a_value_that_the_parameter_cannot_take_is_invalid(
     table = held(**{name: (kind, 1)})
     made = plan_from(table, written(**{name: value}), encoding=encoding, include=CATEGORIES)
     status, category, reason = only_row(made)
-    assert (status, category) == (ApplyStatus.INVALID, WRONG)
+    assert (status, category) == (ApplyStatus.REFUSED, WRONG)
     assert says in reason
     assert not made.stages
 
@@ -194,7 +194,7 @@ def test_a_value_outside_of_the_metadata_range_is_invalid() -> None:
     info = {"P": Info(minimum=0.1, maximum=2.0), "Q": Info(maximum=2.0)}
     for value, says in ((0.05, "0.05 is below the minimum of 0.1"), (2.5, "2.5 is above the maximum of 2")):
         status, category, reason = only_row(plan_from(table, written(P=value), info=info))
-        assert (status, category, says in reason) == (ApplyStatus.INVALID, OUT_OF_RANGE, True)
+        assert (status, category, says in reason) == (ApplyStatus.REFUSED, OUT_OF_RANGE, True)
         assert plan_from(table, written(P=value), info=info, include=OUT_OF_RANGE).to_write
         assert plan_from(table, written(P=value), info=info, force=True).to_write
         assert plan_from(table, written(P=value)).to_write
@@ -212,7 +212,7 @@ def test_a_value_that_the_autopilot_cannot_store_must_be_forced(
     table, wanted = held(P=1.0), written(P=value)
     made = plan_from(table, wanted, autopilot=autopilot, include=OUT_OF_RANGE)
     status, category, reason = only_row(made)
-    assert (status, category) == (ApplyStatus.INVALID, WRONG)
+    assert (status, category) == (ApplyStatus.REFUSED, WRONG)
     assert says in reason
     assert order(plan_from(table, wanted, autopilot=autopilot, force=True)) == [["P"]]
     assert plan_from(held(P=math.nan), written(P=math.nan), autopilot="px4").complete
@@ -231,7 +231,7 @@ def test_values_are_compared_in_the_type_of_the_vehicle() -> None:
     assert plan_from(table, written(A=0.1, B=3.0, C=0, D=16777217, ODD=RAW), autopilot="px4").complete
     made = plan_from(table, written(A=0.1, D=16777216, ODD=RAW[::-1]), autopilot="px4")
     assert order(made) == [["D", "ODD"]]
-    assert plan_from(table, written(ODD=5)).rows["ODD"].status is ApplyStatus.INVALID
+    assert plan_from(table, written(ODD=5)).rows["ODD"].status is ApplyStatus.REFUSED
 
 
 def test_the_order_of_stages_works_on_ardupilot() -> None:
@@ -263,7 +263,7 @@ def test_a_parameter_that_a_step_may_reveal_is_set_later() -> None:
     shown = plan_from(table | held(EK2_ENABLE=1, EK2_ALT_M_NSE=2.0), wanted, autopilot="ardupilot")
     assert order(shown) == [["EK2_ALT_M_NSE", "WPNAV_SPEED"]]
     hidden = plan_from(table | held(EK2_ENABLE=1), wanted, autopilot="ardupilot")
-    assert hidden.rows["EK2_ALT_M_NSE"].status is ApplyStatus.SKIPPED
+    assert hidden.rows["EK2_ALT_M_NSE"].status is ApplyStatus.REFUSED
     assert not made.problems
     assert not hidden.problems, "a reboot may reveal it"
 

@@ -302,8 +302,8 @@ function linesOf(plan, table, other, refresh) {
     .map(({ name, planned }) => {
       const row = table.rows.get(name);
       const { status } = planned;
-      const isOutOfRange = status === "invalid" && planned.category === "out-of-range";
-      const isOut = !row || planned.category === "missing" || (status === "invalid" && !isOutOfRange);
+      const isOutOfRange = planned.category === "out-of-range";
+      const isOut = !row || planned.category === "missing" || (status === "refused" && !isOutOfRange);
       const box = el("input", {
         type: "checkbox",
         checked: status === "set",

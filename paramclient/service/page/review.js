@@ -233,7 +233,7 @@ function inWords(value, row) {
 /** Writes changes in one request, shows each result in its row, and returns the outcomes. */
 async function sendBatch(component, lines, force) {
   const parts = lines.map((line) => ({ line, outcome: outcomeBefore(line) }));
-  const open = parts.filter(({ outcome }) => outcome.status !== "skipped");
+  const open = parts.filter(({ outcome }) => outcome.status !== "refused");
   for (const { line } of open) {
     line.away.replaceChildren();
     line.element.classList.add("busy");
@@ -251,10 +251,10 @@ async function sendBatch(component, lines, force) {
   return parts.map(({ outcome }) => outcome);
 }
 
-/** The outcome of a change before it is sent; `skipped` if the vehicle no longer has the parameter. */
+/** The outcome of a change before it is sent; `refused` if the vehicle no longer has the parameter. */
 function outcomeBefore({ change: { name }, rowNow }) {
   const row = rowNow();
-  if (!row) return { name, isTaken: false, status: "skipped" };
+  if (!row) return { name, isTaken: false, status: "refused" };
   return {
     name,
     before: row.text,
