@@ -102,14 +102,15 @@ class FrameCutter:
         self.damaged = 0
         self.other_bytes = 0
         self._stream = stream
-        self._undecided: dict[Hashable, bytes] = {}
+        self._undecided: dict[Hashable, tuple[bytes, int]] = {}  # and where the search goes on
 
     def cut(self, data: bytes, peer: Hashable) -> list[SeenFrame]:
         """Return the frames that a chunk completes, in order. An empty chunk ends the peer's stream."""
         is_final = not (self._stream and data)
-        data = self._undecided.pop(peer, b"") + data
+        undecided, at = self._undecided.pop(peer, (b"", 0))
+        data = undecided + data
         seen: list[SeenFrame] = []
-        decided = at = 0
+        decided = 0
         while (found := find_magic(data, at)) is not None:
             at = found.start()
             each = _frame_at(data, at)
@@ -127,7 +128,7 @@ class FrameCutter:
             seen += self._classified(data[decided:at])
             decided = at
         if decided < len(data):
-            self._undecided[peer] = data[decided:]
+            self._undecided[peer] = data[decided:], at - decided
             if len(self._undecided) > UNFINISHED_PEERS_MAX:
                 del self._undecided[next(iter(self._undecided))]
         return seen

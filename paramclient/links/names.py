@@ -158,9 +158,7 @@ def _serial(rest: str) -> LinkSpec:
     device, digits = parts.groups()
     baud = int(digits) if digits else DEFAULT_BAUD
     if not BAUD_MIN <= baud <= BAUD_MAX:
-        raise UsageError(
-            f"a baud rate is from {BAUD_MIN} to {BAUD_MAX}, for example 57600 or 115200, not {baud}"
-        )
+        raise UsageError(f"a baud rate is from {BAUD_MIN} to {BAUD_MAX}, such as 57600, not {baud}")
     return LinkSpec(LinkKind.SERIAL, device if device.startswith("/") else device.upper(), baud)
 
 
@@ -185,9 +183,7 @@ def _sim(rest: str) -> LinkSpec:
 
 
 def _replay(rest: str) -> LinkSpec:
-    path, mark, speed = rest.rpartition("?speed=")
-    if not mark:
-        path = rest
+    path, mark, speed = rest.partition("?speed=")
     if not path:
         raise UsageError("the file is missing")
     number = 0.0 if speed == "inf" else _number("speed", speed) if mark else 1.0

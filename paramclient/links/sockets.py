@@ -53,7 +53,7 @@ memory for unknown senders; messages to a single vehicle do not depend on it."""
 
 FIRST_BYTES: Final = 600
 """Bytes of a datagram that are searched for the first frame of a sender: two frames. The limit bounds the
-time for noise."""
+time and the memory for noise."""
 
 PEER_TIMEOUT: Final = 60.0
 """Seconds without data after which an address is forgotten."""
@@ -197,8 +197,9 @@ class UdpIn(SocketLink):
         self._local_port = 0  # of the previous opening
         self._data = memoryview(bytearray(_LARGEST_DATAGRAM))
         self._framer = Framer(stream=False)
-        self._peers: dict[Address, float] = {}
-        """The senders of valid frames and the time of their last data, the latest sender last."""
+        self._peers: dict[Address, tuple[float, bytes]] = {}
+        """The senders, the latest one last: the time of their last data, and its beginning until a broadcast
+        looks for a frame there."""
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`. Returns at most `DATAGRAMS_PER_READ` datagrams; skips empty ones."""
@@ -249,18 +250,22 @@ class UdpIn(SocketLink):
         return True
 
     def _learn(self, sender: Address, data: bytes) -> None:
-        """Remember the sender if it is known or the data is a frame; forget the one silent for longest."""
-        if self._peers.pop(sender, None) is not None or self._framer.receive(data[:FIRST_BYTES]):
-            self._peers[sender] = anyio.current_time()
-            if len(self._peers) > PEERS_MAX:
-                del self._peers[next(iter(self._peers))]
+        """Remember the sender; forget the one silent for longest. A datagram of noise takes no time here."""
+        _, unproven = self._peers.pop(sender, (0.0, data))
+        self._peers[sender] = anyio.current_time(), unproven and data[:FIRST_BYTES]
+        if len(self._peers) > PEERS_MAX:
+            del self._peers[next(iter(self._peers))]
 
     def _destinations(self, peer: Peer | None) -> Sequence[Address]:
         """Return the addresses to send to: of a peer, or for None of all."""
         if peer is not None:
             return [peer] if isinstance(peer, tuple) else []
         oldest = anyio.current_time() - PEER_TIMEOUT
-        return [address for address, at in self._peers.items() if at > oldest]
+        for address, (at, unproven) in list(self._peers.items()):
+            self._peers[address] = at, b""
+            if at <= oldest or (unproven and not self._framer.receive(unproven)):
+                del self._peers[address]
+        return list(self._peers)
 
 
 class UdpOut(UdpIn):

@@ -194,7 +194,7 @@ class Gateway:
 
     def _serves(self, station: GroundStation, table: KeptTable, link: VehicleLink) -> bool:
         """Return whether requests of a station to a component are answered from its table."""
-        if not table.is_kept or (table.source in link.signing and not station.may_sign):
+        if not table.is_kept or (table.source in link.signing and not station.endpoint.may_sign):
             return False
         is_double = any(each is not link and each.is_vehicle(table.source) for each in self.links)
         if is_double and table.source not in self._warned:

@@ -37,9 +37,9 @@ STATION_TIMEOUT: Final = 60.0
 """Seconds of silence after which a station on UDP is forgotten."""
 STATIONS_MAX: Final = 64
 """Stations of one endpoint, at most; the one that was silent for longest is forgotten first."""
-NOISE_MAX: Final = 4
-"""Datagrams without a frame, of one sender and in one read, after which its others are dropped: a flood of
-noise delays no other station."""
+NOISE_MAX: Final = 4_096
+"""Bytes outside of frames, of one sender and in one second, after which its others are dropped unread: a
+flood of noise delays no other station. Data is read in pieces of as many."""
 REQUESTS_MAX: Final = 200
 """Requests of one station that wait for a vehicle or a fetch, at most; further ones are dropped, as on a full
 link."""
@@ -146,11 +146,6 @@ class GroundStation:
     def silence(self) -> float:
         """Seconds since its last frame."""
         return anyio.current_time() - self.received_at
-
-    @property
-    def may_sign(self) -> bool:
-        """Whether what the station asks may be sent with the gateway's signature."""
-        return self.endpoint.is_trusted or self.endpoint.signer is not None
 
     @property
     def state(self) -> dict[str, Any]:
@@ -292,6 +287,7 @@ class MavlinkEndpoint:
 
     Attributes:
         link, name, is_readonly, is_trusted: as given; with a key, all its stations sign.
+        may_sign: whether what its stations ask may be sent with the gateway's signature.
         signer: signs the answers; None without a key.
         stations: the connected stations.
         sending: called with each frame and each datagram that is about to be sent to a station.
@@ -309,6 +305,7 @@ class MavlinkEndpoint:
         self.name = self.link.name
         self.is_readonly = is_readonly
         self.is_trusted = is_trusted and key is None
+        self.may_sign = is_trusted or key is not None
         self.stations: dict[Peer | None, GroundStation] = {}
         self.sending: Callable[[bytes], None] = lambda data: None
         self.signer: Signer | None = None
@@ -364,18 +361,23 @@ class MavlinkEndpoint:
     async def _read(self, take: Take, tasks: anyio.abc.TaskGroup) -> None:
         """Receive frames until the link fails."""
         cutter = FrameCutter(stream=self.link.is_stream)
+        noise: Counter[Peer] = Counter()  # bytes outside of frames, since
+        since = anyio.current_time()
         while True:
-            noise: Counter[Peer] = Counter()  # chunks without a frame
-            for peer, data in await self.link.receive():
-                cut = cutter.cut(data, peer) if noise[peer] < NOISE_MAX else ()
-                sound = (each for each in cut if each.is_proven or not each.is_known)
-                frames = [each for each in sound if self._accepts(each.data)]
-                noise[peer] += not frames
-                for seen in frames:
-                    station = self._station(peer if self._listens else None, tasks)
-                    station.received(seen)
-                    take(station, seen)
-                if not data and self._listens:
+            received = await self.link.receive()
+            if anyio.current_time() >= since + 1:
+                noise, since = Counter(), anyio.current_time()
+            for peer, chunk in received:
+                for at in range(0, len(chunk) or 1, NOISE_MAX):
+                    data = chunk[at : at + NOISE_MAX]
+                    for seen in cutter.cut(data, peer) if noise[peer] < NOISE_MAX else ():
+                        noise[peer] -= seen.size
+                        if self._accepts(seen.data):
+                            station = self._station(peer if self._listens else None, tasks)
+                            station.received(seen)
+                            take(station, seen)
+                    noise[peer] += len(data)
+                if not chunk and self._listens:
                     self._forget(peer)
             if self._listens and not self.link.is_stream:
                 for peer in [peer for peer, each in self.stations.items() if each.silence > STATION_TIMEOUT]:

@@ -262,15 +262,11 @@ async def test_udpin_sends_to_every_known_vehicle() -> None:
             udp_socket(link.address) as two,
             udp_socket(link.address) as odd,
         ):
-            one.send(frame(1))
-            two.send(frame(2))
-            odd.send(b"GET / HTTP/1.1")
+            sent = {one: frame(1), two: frame(1)[7:] + frame(2), odd: bytes(600) + frame(2)}
+            for sock, data in sent.items():
+                sock.send(data)
             received = dict(await collect(link, 3))
-            assert received == {
-                one.getsockname(): frame(1),
-                two.getsockname(): frame(2),
-                odd.getsockname(): b"GET / HTTP/1.1",
-            }
+            assert received == {sock.getsockname(): data for sock, data in sent.items()}
             await link.send(frame(3), None)
             await link.send(frame(4), two.getsockname())
             assert one.recv(1000) == frame(3)
