@@ -58,9 +58,7 @@ def _read_packed(reading: Reading, file_format: FileFormat) -> ParamFile:
     except PackError as error:
         raise FileError(f"invalid packed parameter file: {error}", source=reading.source) from error
     if pack.total > len(pack.entries):
-        reading.notes.append(
-            f"The file contains {len(pack.entries)} of the vehicle's {pack.total} parameters."
-        )
+        reading.notes.append(f"The file has {len(pack.entries)} of the vehicle's {pack.total} parameters.")
     for name, kind, bits, default in pack.entries:
         known = bits if default is None and pack.with_defaults else default
         value, own = from_bits(bits, kind), None if known is None else from_bits(known, kind)
@@ -323,7 +321,7 @@ _BYTES: Final = (
 _TEXTS: Final = (
     (r"\A\s*(?s:<.{,999})?<(?:!doctype html|html)", "a page of HTML; download the file itself"),
     (
-        r'\A(?s:.{,999})<paramfile\b|\A\s*\{(?s:.*?)"(?:shortDesc|DisplayName|metadataTypes)"\s*:',
+        r'\A(?s:.{,999})<paramfile\b|"(shortDesc|DisplayName|metadataTypes)":|"parameters":\s*\[\s*\{(?![^}]*"value":)',
         "metadata of parameters without values, which goes with --metadata",
     ),
     (r"\A\s*<(?:\?xml|!--|\w+[ >])", "XML"),
@@ -346,7 +344,7 @@ _TEXTS: Final = (
         "a list with a third column, perhaps of defaults; remove it",
     ),
 )
-"""What texts in which these patterns are found are. The first one counts."""
+"""What texts in which these patterns are found are, in upper or lower case. The first one counts."""
 
 
 def kind_of(data: bytes) -> str | None:
@@ -360,5 +358,4 @@ def kind_of(data: bytes) -> str | None:
         return "a telemetry log (.tlog), which goes as replay:FILE"
     encoding = "utf-16" if data.startswith(UTF16_MARKS) else "utf-8-sig"
     text = data[:BEGIN_SIZE].decode(encoding, "replace")
-    flags = re.IGNORECASE | re.MULTILINE
-    return next((kind for pattern, kind in _TEXTS if re.search(pattern, text, flags)), None)
+    return next((kind for pattern, kind in _TEXTS if re.search(f"(?im){pattern}", text)), None)

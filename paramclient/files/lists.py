@@ -133,7 +133,8 @@ class _Pairs:
             return value
         else:
             problem = " with a number" if len(words) == 2 else ""
-        self._reading.bad_line(line, f"{self._expected}{problem}", source)
+        is_name = not problem and len(words) > 2 and parse_number(words[-1]) is not None and value is None
+        self._reading.bad_line(line, f"{self._expected}{problem}", source, is_name=is_name)
         return None
 
     def _include(self, line: TextLine, path: str, source: str, chain: tuple[Path, ...]) -> None:
@@ -188,6 +189,8 @@ def read_qgc(reading: Reading, file_format: FileFormat) -> ParamFile:
 
     def take(line: TextLine, comment: str) -> None:
         columns = _blanks.split(line.text)
+        if len(columns) != 5:  # a name that is empty or has a space
+            columns = [each.strip() for each in line.text.split("\t")]
         if len(columns) != 5:
             reading.bad_line(line, _QGC_ROW)
             return
