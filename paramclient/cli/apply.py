@@ -424,7 +424,7 @@ class _Job:
                 remarks.append(f"left out: {counts}; to write them: {includes}")
             if late:
                 remarks.append(f"takes effect after a reboot: {listed(late)}")
-            remarks.insert(0, made.unchecked_note)
+            remarks.insert(0, "" if self.state.is_restore else made.unchecked_note)
         for remark in filter(None, remarks):
             say(f"{session.label}: {remark}")
         return code

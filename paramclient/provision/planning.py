@@ -330,17 +330,16 @@ class _Planner:
                 and not (row.category == MISSING and name.startswith(hidden))
             },
             extra=tuple(name for name in self.current if name not in self.wanted),
-            unchecked=tuple(name for name, row in rows.items() if self.is_unchecked(row)),
+            unchecked=tuple(
+                name
+                for name, row in rows.items()
+                if row.status is ApplyStatus.SET
+                and not isinstance(row.wanted.settable, str | bytes)
+                and name not in self.described
+            ),
             firmware=() if file is None or own is None else (file, own),
             awaiting_reboot=awaiting_reboot,
         )
-
-    def is_unchecked(self, row: ApplyRow) -> bool:
-        """Return whether the range of a value to write was to be checked, and is not known."""
-        name, value = row.name, row.wanted.settable
-        is_to_check = row.status is ApplyStatus.SET and not isinstance(value, str | bytes)
-        is_to_check = is_to_check and not (self.force or self.choice.has(name, OUT_OF_RANGE))
-        return is_to_check and name not in self.described
 
     def row(self, wanted: WrittenParam) -> ApplyRow:
         """Return the row of one parameter; `settle_missing` completes rows of missing parameters."""
