@@ -94,7 +94,7 @@ class Node:
         self._spawn = spawn
         self._identifying: Shared[None] = Shared(spawn, gate)
 
-    def receive(self, message: Message, now: float, version: int = 2) -> None:
+    def receive(self, message: Message, now: float, version: int = 2, sequence: int = 0) -> None:
         """Take a message of the component: into the tables, and to the conversations that wait for it."""
         presence = self.presence
         silence, presence.received_at = now - presence.received_at, now
@@ -107,7 +107,7 @@ class Node:
             self._spawn(self._request_clock)
         match message:
             case messages.ParamValue():
-                if (until := self.plain.receive(message, now)) is not None:
+                if (until := self.plain.receive(message, now, sequence)) is not None:
                     self._spawn(read_again, self.plain, message.param_id, until)
                 if message.param_id == messages.HASH_CHECK:
                     self.plain.announce(Digest.of(message))

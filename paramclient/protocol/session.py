@@ -10,7 +10,7 @@ from typing import Any, Final, Generic, TypeVar
 import anyio
 
 from paramclient.errors import AnotherVehicle, NoReply
-from paramclient.model.values import Encoding, Param, ParamType, as_reported
+from paramclient.model.values import Encoding, Param, ParamType
 from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
 from paramclient.protocol.ftp import FTP_SILENT_TIME, SILENT_LOST
@@ -27,9 +27,9 @@ FOREIGN_SET_MEMORY: Final = 2.0
 """Seconds for which a PARAM_SET of another station explains a change."""
 FOREIGN_SETS_MAX: Final = 256
 """PARAM_SETs of other stations that are remembered; the oldest is dropped first."""
-LATE_ANSWER_TIME: Final = 0.3
-"""Seconds after a change in which an ArduPilot may answer an earlier read: it takes the value when it queues
-the answer, and sends it up to 100 ms later."""
+LATE_TIME: Final = 0.3
+"""Seconds after a value in which an older one may arrive: an ArduPilot takes the value of a read when it
+queues the answer, and sends it up to 100 ms later; some links let datagrams overtake others."""
 REPLACED_MAX: Final = 16
 """Values of one parameter that are remembered meanwhile: it acknowledges its sets every 6 ms at most."""
 
@@ -118,18 +118,18 @@ class _Run(Generic[T]):
 
 
 @dataclass(slots=True)
-class ReplacedValue:
-    """The value before a change, while an answer to an earlier read may still bring it.
+class Replaced:
+    """The values before a change, while an answer to an earlier read may still bring them.
 
     Attributes:
-        param: the parameter before the change.
-        until: when such an answer can arrive no more.
-        was_received: whether the value was received meanwhile, and ignored: it may be the present one.
+        params: the parameter before the change, and before earlier ones.
+        until: when such an answer can arrive no more. Another value until then is read again.
+        was_other: whether another value was received: it may be a later change.
     """
 
-    param: Param
+    params: list[Param]
     until: float
-    was_received: bool = False
+    was_other: bool = False
 
 
 class Session:
@@ -185,7 +185,7 @@ class Session:
         self.ftp_unanswered = 0
         self.announced: Digest | None = None
         self.written_at = -math.inf
-        self.replaced: dict[str, list[ReplacedValue]] = {}
+        self.replaced: dict[str, Replaced] = {}
         self.contradicted: Callable[[], None] = lambda: None
         self.serves_reads: dict[type[str | int], bool] = {}
         self.reads_by_index = False
@@ -196,32 +196,47 @@ class Session:
         self._identified = identified
         self._locks: dict[str, anyio.Lock] = {}
         self._foreign_sets: dict[str, tuple[str, float]] = {}
+        self._sequences: dict[str, int] = {}  # of the frame with each value
 
-    def receive(self, message: ReportedValue, now: float) -> float | None:
-        """Store a value, unless it may be the answer to a read from before a change.
+    def receive(self, message: ReportedValue, now: float, sequence: int) -> float | None:
+        """Store a value, unless it may be older than the known one.
 
         Then, return the time at which only the parameter's present value can be received.
+
+        Args:
+            message: the value.
+            now: when it arrived.
+            sequence: of its frame: a lower one than that of the known value was overtaken.
         """
         name, spelled = message.param_id, self.spelled(message.param_id)
         is_listed = message.param_index != NO_INDEX and spelled not in self.table.params
         if name != spelled and self.identification.is_ardupilot and not is_listed:
             name, message = spelled, message._replace(param_id=spelled)
         _, raw, number, _, _ = message
-        known, encoding = self.table.params.get(name), self.table.encoding
-        is_sent, replaced = self.sent.get(name) == raw, self.replaced.get(name, [])
-        for each in replaced:
-            same = each.param.type == number and as_reported(each.param.bits, number, encoding) == raw
-            if same and now <= each.until and not is_sent:
-                each.was_received = True
-                return each.until
-        if name in self.acknowledging and encoding is Encoding.BYTEWISE and known and known.type != number:
+        table, replaced, is_sent = self.table, self.replaced.get(name), self.sent.get(name) == raw
+        known, may_read = table.params.get(name), not self.identification.listens_only
+        is_bytes = table.encoding is Encoding.BYTEWISE
+        if name in self.acknowledging and is_bytes and known and known.type != number:
             return None
-        self.table.store(self.typed(message), now, is_exact=is_sent)
-        is_read = self.identification.is_ardupilot and not self.identification.listens_only
-        if is_read and known and not known.same_value(self.table.params[name]):
-            kept = [each.param for each in replaced if each.was_received or now <= each.until]
-            until = now + LATE_ANSWER_TIME
-            self.replaced[name] = [ReplacedValue(each, until) for each in [*kept, known][-REPLACED_MAX:]]
+        message = self.typed(message)
+        is_other = known is not None and not table.is_reported(known, raw, message.param_type)
+        until = table.moments.get(name, -math.inf) + LATE_TIME
+        behind = (self._sequences.get(name, sequence) - sequence) % 256
+        is_overtaken = may_read and 0 < behind < 128 and now <= until
+        if is_overtaken and is_other:
+            return until
+        if replaced is not None and now <= replaced.until:
+            if is_other and not is_sent:
+                replaced.was_other = True
+                return replaced.until
+            if replaced.was_other and not is_other:  # it may have changed back
+                replaced.until, replaced.was_other = now + LATE_TIME, False
+        table.store(message, now, is_exact=is_sent)
+        if name in table.params and not is_overtaken:
+            self._sequences[name] = sequence
+        if known is not None and is_other and may_read and self.identification.is_ardupilot:
+            before = replaced.params if replaced else []
+            self.replaced[name] = Replaced([*before, known][-REPLACED_MAX:], now + LATE_TIME)
         return None
 
     def typed(self, message: ReportedValue) -> ReportedValue:

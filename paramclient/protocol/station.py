@@ -267,7 +267,7 @@ class Station:
                 *(self.link, node.system, node.component, peer_in_words(node.told_rival)),
             )
         self._ended_peers.discard(peer)
-        node.receive(message, now, frame.version)
+        node.receive(message, now, frame.version, frame.sequence)
 
     def _moves(self, node: Node, peer: Peer, message: Message, now: float) -> bool:
         """Return whether a component is at another peer now: its own is silent, or it is the same link."""

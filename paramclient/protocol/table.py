@@ -181,7 +181,7 @@ class Table:
             if len(self.params) >= NAMES_MAX:
                 return
             new = self.dialect.param(name, raw, number, place, self._encoding)
-        elif not is_exact and self._is_reported(old, raw, number):
+        elif not is_exact and self.is_reported(old, raw, number):
             new = replace(old, index=place, trust=Trust.LIVE)
         else:
             new = self.dialect.param(name, raw, number, place, self._encoding)
@@ -265,7 +265,7 @@ class Table:
         raw = as_reported(entry.bits, entry.type, self._encoding)
         moment = max(now, self.moments.get(name, now))
         is_newer = old is not None and moment > now and old.trust is Trust.LIVE
-        if old is not None and is_newer and not self._is_reported(old, raw, entry.type):
+        if old is not None and is_newer and not self.is_reported(old, raw, entry.type):
             self.params[name] = replace(old, index=index, default=default)
             return
         self.moments[name] = moment
@@ -322,7 +322,7 @@ class Table:
         if was_complete:
             self.recounted()
 
-    def _is_reported(self, known: Param, raw: bytes, number: int) -> bool:
+    def is_reported(self, known: Param, raw: bytes, number: int) -> bool:
         """Return whether these bytes are the component's form of a known value, which may be rounded."""
         if known.type != number or self.dialect is not PLAIN:
             return False

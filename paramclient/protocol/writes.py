@@ -246,9 +246,9 @@ class _Write:
     async def run(self) -> SetResult:
         """Send the set until its outcome is proven: by the wanted value, or by the same other one twice."""
         self._encode()
-        for each in self.session.replaced.get(self.name, ()):
-            if self._is_wanted(each.param):  # a late answer would prove it
-                await anyio.sleep_until(each.until + 0.001)
+        replaced = self.session.replaced.get(self.name)
+        if replaced and (replaced.was_other or any(map(self._is_wanted, replaced.params))):
+            await anyio.sleep_until(replaced.until + 0.001)
         dialect = self.session.dialect
         keys = [(ParamExtAck, self.name)] if dialect.has_ack else [(dialect.value, self.name), StatusText]
         adjusted: Param | None = None

@@ -86,6 +86,8 @@ def test_the_newest_lines_are_kept(cache: ParamCache, monkeypatch: pytest.Monkey
 
 def test_the_state_at_a_time(cache: ParamCache) -> None:
     change(cache, 9, -5)
+    with pytest.raises(CacheError, match="never complete; snapshots: none"):
+        cache.state_at("1", 1, NOW)
     cache.save(whole_table(2))
     change(cache, 5, 10)
     cache.save(update(stored("NEW", 1, at=NOW + 20), at=NOW + 20))
@@ -104,12 +106,6 @@ def test_the_state_at_a_time(cache: ParamCache) -> None:
         cache.state_at("1", 1, NOW - 1)
     with pytest.raises(UsageError):
         cache.state_at("1", 1, -1.0)
-
-
-def test_the_states_of_a_table_that_was_never_complete_are_unknown(cache: ParamCache) -> None:
-    change(cache, 1, 0)
-    with pytest.raises(CacheError, match="never complete; snapshots: none"):
-        cache.state_at("1", 1, NOW + 1)
 
 
 def test_the_state_of_extended_parameters(cache: ParamCache) -> None:

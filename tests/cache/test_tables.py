@@ -150,20 +150,12 @@ def test_a_whole_table_removes_other_names(cache: ParamCache) -> None:
     ]
 
 
-def test_a_whole_table_keeps_names_that_were_observed_later(cache: ParamCache) -> None:
+def test_an_older_table_or_removal_keeps_names_that_were_observed_later(cache: ParamCache) -> None:
     cache.save(update(stored("NEW", 1, at=NOW + 5), at=NOW + 5))
-    cache.save(whole_table(2))
+    cache.save([whole_table(2), update(removed={"NEW": NOW + 4}, at=NOW + 6)])
     table = cache.component("1")
     assert set(table.params) == {"NEW", "PARAM_0", "PARAM_1"}
     assert (table.hash, table.complete) == (None, False)
-
-
-def test_a_removal_before_the_last_observation_has_no_effect(cache: ParamCache) -> None:
-    cache.save(update(stored("A", 1, at=NOW + 5), at=NOW + 5))
-    cache.save(update(removed={"A": NOW + 4}, at=NOW + 6))
-    assert values(cache) == {"A": 1}
-    cache.save(update(removed={"A": NOW + 6}, at=NOW + 6))
-    assert values(cache) == {}
 
 
 Event = tuple[int, int, int]

@@ -120,6 +120,7 @@ async def test_an_ardupilot_takes_names_in_any_case_and_its_table_has_one_of_eac
         assert (await read(session, "rtl_alt")).param_id == "RTL_ALT"
         result = await write(session, "rtl_alt", 1000)
         assert (result.name, result.actual, result.attempts) == ("RTL_ALT", 1000, 1)
+        await anyio.sleep(1.0)
         conversation.hear(ParamValue("Rtl_Alt", struct.pack("<f", 900.0), ParamType.INT32, 900, 3))
         assert [session.table.params[name].value for name in session.table.params] == [900]
 

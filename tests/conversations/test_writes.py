@@ -17,7 +17,7 @@ from paramclient.protocol.reads import read, read_many, read_param
 from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.protocol.writes import write, write_many
-from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from paramclient.wire.messages import AutopilotVersion, CommandLong, Message, ParamError, ParamSet, ParamValue
 from tests.conversations.partial import Partial
 from tests.conversations.virtual import Silence, Tap, converse, losing, meanwhile, talking, virtual_on_both
@@ -218,17 +218,14 @@ async def test_a_late_answer_with_an_old_value_undoes_no_change() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     async with talking(Air.symmetric([vehicle], delay=0.005)) as (conversation, session):
         await fetch_all(session)
-        for step in range(16):
+        for step in range(8):
             async with meanwhile(read(session, "ATC_ANG_RLL_P")):
-                await anyio.sleep(0.013 * (step % 8))
-                if step < 8:
-                    await write(session, "ATC_ANG_RLL_P", 3.0 + step)
-                else:
-                    vehicle.set_param("ATC_ANG_RLL_P", 3.0 + step)  # by another station
+                await anyio.sleep(0.013 * step)
+                await write(session, "ATC_ANG_RLL_P", 3.0 + step)
             await anyio.sleep(1.0)
             assert session.table.params["ATC_ANG_RLL_P"].value == 3.0 + step
         changes = [each for each in conversation.changes if each.kind == "changed"]
-        assert [each.by for each in changes] == ["us"] * 8 + ["vehicle"] * 8
+        assert [each.by for each in changes] == ["us"] * 8
         # a write back is no late answer, and a change back by another station is found by a read
         await write(session, "ATC_ANG_RLL_P", 3.5)
         assert (await write(session, "ATC_ANG_RLL_P", 10.0)).status == "accepted"
@@ -236,6 +233,22 @@ async def test_a_late_answer_with_an_old_value_undoes_no_change() -> None:
         vehicle.set_param("ATC_ANG_RLL_P", 10.0)
         await anyio.sleep(1.0)
         assert session.table.params["ATC_ANG_RLL_P"].value == 10.0
+
+
+@pytest.mark.parametrize(("vehicle", "reorder"), [(PX4Vehicle(), 0.5), (ArduPilotVehicle(), 0.0)])
+async def test_changes_are_received_in_their_order(vehicle: Vehicle, reorder: float) -> None:
+    """A value that others overtake, or that an ArduPilot has kept for a read, is none."""
+    name = "BAT1_CAPACITY" if isinstance(vehicle, PX4Vehicle) else "ATC_ANG_RLL_P"
+    async with talking(Air([vehicle], downlink=FaultyLink(reorder=reorder))) as (conversation, session):
+        for value in range(100):
+            async with meanwhile(read(session, name)):
+                vehicle.set_param(name, float(value))
+                await anyio.sleep(0.004)
+                vehicle.set_param(name, value + 0.5)
+        await anyio.sleep(1.0)
+        values = [each.new.value for each in conversation.changes if each.new]
+        assert values[1:] == sorted(values[1:])
+        assert values[-1] == 99.5
 
 
 async def test_no_set_is_sent_before_the_encoding_is_certain() -> None:

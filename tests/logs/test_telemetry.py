@@ -32,21 +32,19 @@ def a_replay(path: Path | str, **options: object) -> ParamClient:
 
 
 async def test_a_file_that_is_not_a_log(tmp_path: Path) -> None:
-    with pytest.raises(LinkError, match=r"cannot open .*nowhere\.tlog: No such file"):
-        async with a_replay(tmp_path / "nowhere.tlog"):
-            raise AssertionError("it was opened")
-    for content in (b"", b"FRAME_CLASS 1\n" * 50):
-        (tmp_path / "other.txt").write_bytes(content)
-        with pytest.raises(LinkError, match="is not a telemetry log"):
-            async with a_replay(tmp_path / "other.txt"):
-                raise AssertionError("it was opened")
-    with pytest.raises(LinkError, match="Is a directory"):
-        async with a_replay(tmp_path):
-            raise AssertionError("it was opened")
+    (tmp_path / "empty").touch()
+    (tmp_path / "other.txt").write_bytes(b"FRAME_CLASS 1\n" * 50)
     os.mkfifo(tmp_path / "pipe")
-    for endless in ("/dev/zero", tmp_path / "pipe"):
-        with pytest.raises(LinkError, match="is not a regular file"):
-            async with a_replay(endless):
+    for name, why in (
+        ("nowhere.tlog", r"cannot open .*nowhere\.tlog: No such file"),
+        ("empty", "is not a telemetry log"),
+        ("other.txt", "is not a telemetry log"),
+        (".", "Is a directory"),
+        ("pipe", "is not a regular file"),
+        ("/dev/zero", "is not a regular file"),
+    ):
+        with pytest.raises(LinkError, match=why):
+            async with a_replay(tmp_path / name):
                 raise AssertionError("it was opened")
 
 
