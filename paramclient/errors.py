@@ -199,11 +199,8 @@ class FileError(UsageError):
         line: int | None = None,
         more: tuple[str, ...] = (),
     ) -> None:
-        if line is not None:
-            place = f"{source}:{line}: " if source else f"line {line}: "
-        else:
-            place = f"{source}: " if source else ""
-        super().__init__("\n".join((f"{place}{message}", *more)))
+        place = source if line is None else f"{source}:{line}" if source else f"line {line}"
+        super().__init__("\n".join((f"{place}: {message}" if place else message, *more)))
         self.source = source
         self.line = line
         self.reason = message
@@ -444,7 +441,8 @@ class NoReply(ParamClientError, TimeoutError):
 
     def __init__(self, awaited: str, *, attempts: int, waited: float, hint: str = "") -> None:
         tries = f" after {attempts} {'try' if attempts == 1 else 'tries'}" if attempts else ""
-        super().__init__(f"no reply: {awaited}{tries} in {waited:.1f} s{'. ' if hint else ''}{hint}")
+        when = f"in {waited:.1f} s" if waited >= 0.05 else "in time"
+        super().__init__(f"no reply: {awaited}{tries} {when}{'. ' if hint else ''}{hint}")
         self.awaited = awaited
         self.attempts = attempts
         self.waited = waited

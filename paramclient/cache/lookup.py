@@ -93,7 +93,7 @@ def find_vehicle(
     reason = "" if problem is None else f": {problem}"
     raise UnknownVehicle(
         f"{wanted} is not in the cache {place}{reason}. The cache holds "
-        + (f"{counted(len(kept), 'vehicle')}:{_listed(kept)}" if kept else "no vehicle."),
+        + (f"{counted(len(kept), 'vehicle')}:{_listed(kept)}" if kept else "no vehicle"),
         vehicles=tuple(map(str, kept)),
     )
 

@@ -24,7 +24,7 @@ from paramclient.cli.session import ChosenVehicle, CommandSession, check_given, 
 from paramclient.cli.set_command import interruptible
 from paramclient.cli.sources import described, filled, is_pattern_name, resolve_all
 from paramclient.files import FileFormat, ParamFile
-from paramclient.model.names import age_in_words, counted, is_pattern
+from paramclient.model.names import age_in_words, is_pattern
 from paramclient.model.paramset import ParamSet
 from paramclient.provision.apply_restore import load_restore_point, restore_categories
 from paramclient.provision.apply_rules import CATEGORIES, READ_ONLY
@@ -214,9 +214,9 @@ async def _earlier_state(moment: float | int | None, session: CommandSession) ->
         find = bind(load_restore_point, cache, *place, extended=extended)
         point = await anyio.to_thread.run_sync(find)
     except (errors.CacheError, errors.UnknownVehicle) as error:  # the user named no vehicle of the cache
-        problem = f"nothing was sent, as no earlier state can be read: {error}"
-        hint = "A backup file can be restored without the cache (--no-cache)"
-        raise errors.CacheError(f"{problem}. {hint}") from error
+        hint = "a backup file can be restored without the cache (--no-cache)"
+        problem = f"nothing was sent, as no earlier state can be read: {error}; {hint}"
+        raise errors.CacheError(problem) from error
     when = f"{age_in_words(time.time() - point.at)} ago (snapshot {point.snapshot})"
     changed = listed([*point.changes]) or "nothing, as far as is known"
     say(f"{session.prefix}the state is that before the last apply, {when}; changed since then: {changed}")
@@ -246,8 +246,7 @@ async def _defaults(chosen: Sequence[str], choice: MetadataChoice, session: Comm
         raise errors.VehicleError(NO_DEFAULTS, *session.component.address)
     say_sources(session.label, found.values())
     without = [name for name in found if name not in wanted]
-    if is_cut := bool(missing) and any(map(is_pattern, chosen)):
-        report(f"{session.prefix}incomplete: {counted(len(missing), 'parameter')} not received")
+    is_cut = any(map(is_pattern, chosen)) and session.report_missing(missing) > 0
     if without:
         report(f"{session.prefix}not written, as their default is not known: {listed(without)}")
     return State(ParamSet(wanted, source="the firmware's defaults"), is_part=is_cut or bool(without))

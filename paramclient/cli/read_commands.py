@@ -15,7 +15,6 @@ from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import (
     ExitCode,
     cells_of,
-    listed,
     local_time,
     milliseconds,
     print_json,
@@ -28,7 +27,7 @@ from paramclient.cli.session import CommandSession, Sessions, check_given, get_c
 from paramclient.client.client import Event
 from paramclient.errors import ParamClientError, VehicleError
 from paramclient.links import ReplayLink
-from paramclient.model.names import NameChoice, counted
+from paramclient.model.names import NameChoice, counted, is_pattern
 from paramclient.model.notation import hash_text, rounded, time_text
 from paramclient.model.paramset import ParamMap
 from paramclient.protocol.channel import task_group
@@ -109,7 +108,8 @@ async def get(
             read = {each.name: param_json(each, info_of(known, each.name), whole=True) for each in params}
             item = {"params": read} | _errors_json(errors)
             columns = ("name", "value", "type", "index", "meaning", "units")
-            return _Shown(item, columns, partial(_report_get, session, errors.values()))
+            missing = session.component.session.table.missing() if any(map(is_pattern, chosen)) else []
+            return _Shown(item, columns, partial(_report_get, session, errors.values(), missing))
 
         done = await found.work(work)
     return found.show(done)
@@ -151,19 +151,14 @@ def _report_fetch(session: CommandSession, result: FetchResult, errors: Collecti
         fetched = f"{result.received}{of} {noun_of(session.component)}s of {label} from {result.source}"
         traffic = f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent{link}"
         say(f"{fetched} in {result.elapsed:.2f} s, {lost}{trip}{traffic}{crc}")
-    code = report_all(errors, session.prefix)
-    if not result.missing:
-        return code
-    missing = f"{counted(len(result.missing), 'parameter')}, index {listed(result.missing)}"
-    report(f"incomplete: {label} did not send {missing}; run the command again to request them")
-    return max(code, ExitCode.INCOMPLETE)
+    return max(report_all(errors, session.prefix), session.report_missing(result.missing))
 
 
-def _report_get(session: CommandSession, errors: Collection[ParamClientError]) -> int:
-    """Print a doubt about the values, and the errors; return the exit code."""
+def _report_get(session: CommandSession, errors: Collection[ParamClientError], missing: list[int]) -> int:
+    """Print a doubt about the values, the errors, and what is missing; return the exit code."""
     if doubt := session.component.session.encoding_doubt:
         report(f"{session.prefix}{doubt}")
-    return report_all(errors, session.prefix)
+    return max(report_all(errors, session.prefix), session.report_missing(missing))
 
 
 # watch

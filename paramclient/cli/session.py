@@ -19,7 +19,7 @@ from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, NoReply, ParamClientError, UnknownParameter, UsageError
 from paramclient.links import LinkKind
 from paramclient.model.identity import version_text
-from paramclient.model.names import NameChoice, did_you_mean, is_pattern, nearest_names
+from paramclient.model.names import NameChoice, counted, did_you_mean, is_pattern, nearest_names
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust, check_name
 from paramclient.protocol.fetch import FetchResult, Progress
@@ -178,6 +178,13 @@ class CommandSession:
                 what = f"{received}{of} {noun_of(component)}s of {self.label}"
                 say(f"interrupted: {what} received and {kept}")
                 raise
+
+    def report_missing(self, missing: Sequence[int]) -> int:
+        """Print which indices the component did not send, if any; return the exit code."""
+        if missing:
+            what = f"{counted(len(missing), 'parameter')}, index {listed(missing)}"
+            report(f"incomplete: {self.label} did not send {what}; run the command again to request them")
+        return ExitCode.INCOMPLETE if missing else ExitCode.DONE
 
     async def check_only(self) -> None:
         """Check that the component is still the only one that --vehicle fits.
@@ -454,7 +461,10 @@ async def get_chosen(
             names = sorted(NameChoice([text]).divide(component.params)[0])
         elif is_fetched and session.client.listens_only and names[0] not in component.params:
             names = []
-        if not names:
+        if not names and component.session.table.missing():
+            awaited = f"a parameter of {session.address} that matches {text}"
+            found[text] = NoReply(awaited, attempts=0, waited=0.0)
+        elif not names:
             nearest = nearest_names(text, component.params)
             what = f"{session.address} has no parameter that matches {text}{did_you_mean(nearest)}"
             found[text] = UnknownParameter(what, *component.address, name=text, nearest=nearest)

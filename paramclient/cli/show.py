@@ -12,7 +12,7 @@ from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import ExitCode, cells_of, local_time, print_json, print_line, print_table, say
 from paramclient.cli.session import check_given
 from paramclient.cli.sources import check_link, described, part_of
-from paramclient.errors import UsageError
+from paramclient.errors import UsageError, VehicleError
 from paramclient.files.formats import address
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo
 from paramclient.model.comparison import non_defaults
@@ -69,8 +69,7 @@ async def show(
         shown = part_of(part, non_defaults(add_defaults(part, given))) if changed else part
         views.append((shown, known, defaults))
     if changed and not any(defaults for _, _, defaults in views):
-        say(NO_DEFAULTS)
-        return ExitCode.INCOMPLETE
+        raise VehicleError(NO_DEFAULTS, sets[0].system or 0, sets[0].component or 0)
     items = [set_json(shown, known, whole=bool(chosen)) for shown, known, _ in views]
     if options.json:
         print_json({"components": items})

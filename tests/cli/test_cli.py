@@ -144,11 +144,12 @@ def test_fetch_prints_a_table_and_a_summary(command: Command, warm: Path) -> Non
 def test_missing_parameters_are_named(command: Command, put: Put) -> None:
     url = put(GenericVehicle({"A": 1, "B": 2, "C": 3}, dead=["B"]))
     fetched = command("fetch", url, "--json", "--no-cache", "--timeout", 5)
-    assert fetched.code == 1
-    assert fetched.json["missing"] == [1]
-    assert (fetched.json["count"], fetched.json["received"]) == (3, 2)
-    assert list(fetched.json["params"]) == ["A", "C"]
-    assert "paramclient: incomplete: 1/1 generic did not send 1 parameter, index 1; " in fetched.err
+    found = [fetched.json[each] for each in ("missing", "count", "received")]
+    assert (fetched.code, found, [*fetched.json["params"]]) == (1, [[1], 3, 2], ["A", "C"])
+    read = command("get", url, "?", "B*", "--no-cache", "--timeout", 5)
+    assert (read.code, "a parameter of 1/1 that matches B* in time" in read.err) == (3, True)
+    for err in (fetched.err, read.err):
+        assert "paramclient: incomplete: 1/1 generic did not send 1 parameter, index 1; " in err
 
 
 # get

@@ -54,7 +54,8 @@ def test_unknown_defaults_are_an_error_that_says_what_to_do(command: Command, pu
 
 def test_a_cached_table_is_compared_with_the_remembered_metadata(command: Command, put: Put) -> None:
     assert command("fetch", put(quad()), "--json").code == 0  # loads no metadata
-    assert command("show", "1", "--changed").code == 1
+    unknown = command("show", "1", "--changed")
+    assert (unknown.code, unknown.err.split(" are ")[0]) == (1, "paramclient: the firmware's defaults")
     assert command("fetch", put(quad()), "--changed", "--metadata", "vehicle").code == 0
     shown = command("show", "1", "--changed")
     assert shown.code == 0, shown.err
