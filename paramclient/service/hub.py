@@ -270,10 +270,6 @@ class Target:
         """Return the metadata of a parameter, or None."""
         return None if self.metadata is None else self.metadata.find(name)
 
-    def defaults_of(self, names: Iterable[str]) -> dict[str, int | float]:
-        """Return the defaults in the metadata, by name."""
-        return {} if self.metadata is None else self.metadata.defaults_of(names)
-
     def shown(self, param: Param, *, whole: bool = False) -> JsonObject:
         """Return a parameter of the table as JSON; with `whole`, with all its metadata."""
         return table_param_json(param, self.info(param.name), whole=whole)
@@ -328,8 +324,7 @@ class Target:
         """
         component, cache = self.component, self.hub.cache
         if cache is None:
-            detail = "The service runs without a cache and has no earlier states."
-            raise ServiceError(409, "no-cache", detail)
+            raise ServiceError(409, "no-cache", "The service runs without a cache: it has no earlier states.")
         await wait_for_identity(component)
         place = component.identity.key, component.component
         work = partial(call, cache, *place, *more, extended=component.is_extended)

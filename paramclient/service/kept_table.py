@@ -47,8 +47,10 @@ LOADING_WAIT: Final = 1.0
 READ_TIMEOUT: Final = 3.0
 """Seconds for a value or a name that the table does not have."""
 SET_TIMEOUT: Final = 2.9
-"""Seconds for a verified write: a station has a result within 3 s. During a fetch, the acknowledgement may
-wait behind the list in the radio's queue, and takes as long as it needs: an error would be wrong."""
+"""Seconds for a verified write: a station has a result within 3 s."""
+OVERTAKING_BEATS: Final = 2
+"""Heartbeats since a set that show, during a fetch, that its acknowledgement does not wait behind the list in
+the radio's queue: an error would be wrong then. The first of them may be older than the set."""
 ASKED_AT_ONCE: Final = 4
 """Reads by stations that the vehicle is asked for at once."""
 TAKE_OVER_TIME: Final = 10.0
@@ -64,11 +66,9 @@ CODES: Final = (
     (errors.TypeMismatch, ParamErrorCode.TYPE_MISMATCH),
     (errors.AmbiguousVehicle, ParamErrorCode.PERMISSION_DENIED),
     ((errors.UsageError, errors.ValueNotApplied), ParamErrorCode.VALUE_OUT_OF_RANGE),
+    (ParamClientError, ParamErrorCode.COMPONENT_NOT_FOUND),  # it does not answer
 )
 """The codes of PARAM_ERROR by exception; the first class that matches counts."""
-
-NO_ANSWER: Final = ParamErrorCode.COMPONENT_NOT_FOUND
-"""The code for a component that does not answer."""
 
 Key = TypeVar("Key")
 Which: TypeAlias = "str | int"
@@ -122,8 +122,7 @@ def value_of(session: Session, param: Param, *, index: int | None = None) -> Rep
     """
     count = session.table.count or 0
     if index is None:
-        is_ardupilot = session.identification.is_ardupilot
-        index = NO_INDEX if param.index is None or is_ardupilot else param.index
+        index = NO_INDEX if param.index is None or session.identification.is_ardupilot else param.index
     if session.dialect.has_ack:
         raw = ext_bytes(param).ljust(EXT_VALUE_SIZE, b"\0")
     elif param.is_raw:
@@ -183,7 +182,7 @@ class KeptTable(Stream[Change]):
     Attributes:
         component, session, source: of the component.
         changes: the number of changes so far.
-        heartbeat: the last one, with plain parameters.
+        heartbeat, beats: the last one with plain parameters, and how many there were.
     """
 
     most = 0  # changes are taken at once, and none is queued
@@ -195,6 +194,7 @@ class KeptTable(Stream[Change]):
         self.source = (component.system, component.component)
         self.changes = 0
         self.heartbeat: Message | None = None
+        self.beats = 0
         self._announce = announce
         self._list_at = lru_cache(1)(lambda state: whole_list(component.session))
         self._unserved_until = -math.inf
@@ -218,9 +218,8 @@ class KeptTable(Stream[Change]):
     def is_kept(self) -> bool:
         """Whether the gateway answers for the component; otherwise requests pass to it."""
         node, now = self.component.node, anyio.current_time()
-        is_decoding = is_decoded(self.session) or self.is_loading
-        is_doubtful = node.identification.is_encoding_certain and not is_decoding
-        is_usable = not (is_doubtful or self.session.table.left_out or node.has_rival(now))
+        doubt = node.identification.is_encoding_certain and not (is_decoded(self.session) or self.is_loading)
+        is_usable = not (doubt or self.session.table.left_out or node.has_rival(now))
         return is_usable and node.identification.has_parameters and now >= self._unserved_until
 
     @property
@@ -363,10 +362,10 @@ class KeptTable(Stream[Change]):
 
     def known(self, which: Which) -> ReportedValue | None:
         """Return a value that is known to be the vehicle's, by name or index."""
-        table = self.session.table
         if which == HASH_CHECK:
             return None if self.state_key is None else digest_of(self.session)
-        name, index = (table.names.get(which), which) if isinstance(which, int) else (which, None)
+        names = self.session.table.names
+        name, index = (names.get(which), which) if isinstance(which, int) else (which, None)
         param = known_param(self.session, name)
         return None if param is None else value_of(self.session, param, index=index)
 
@@ -378,8 +377,7 @@ class KeptTable(Stream[Change]):
     async def _read(self, which: Which, turns: anyio.CapacityLimiter) -> None:
         try:
             with anyio.move_on_after(READ_TIMEOUT):
-                value = await self._find(which, turns)
-                self._say(self._reads[which], value)
+                self._say(self._reads[which], await self._find(which, turns))
         except (errors.UnknownParameter, errors.Refused) as error:
             if len(self._unknown) >= UNKNOWN_NAMES_MAX:
                 self._unknown.clear()
@@ -415,11 +413,15 @@ class KeptTable(Stream[Change]):
             self.component.core.spawn(self._set, key, asker)
 
     async def _set(self, key: SetKey, first: Asker) -> None:
-        code = int(NO_ANSWER)
+        """Write a value, and write it again while a result may wait behind the list of a fetch."""
+        code, is_open = int(ParamErrorCode.COMPONENT_NOT_FOUND), True
         try:
-            with anyio.move_on_after(math.inf if self.is_loading else SET_TIMEOUT):
-                async with first.station.writing:
-                    code = await self._write(key, f"station {first.system}/{first.component}")
+            while is_open:
+                beats_min = self.beats + OVERTAKING_BEATS * self.is_loading
+                with anyio.move_on_after(SET_TIMEOUT) as scope:
+                    async with first.station.writing:
+                        code = await self._write(key, f"station {first.system}/{first.component}")
+                is_open = scope.cancelled_caught and self.beats < beats_min and not self.is_lost
         except ParamClientError as error:
             code = _code_of(error)
         finally:
@@ -483,4 +485,4 @@ def _code_of(error: ParamClientError) -> int:
     """Return the PARAM_ERROR of an error."""
     if isinstance(error, errors.Refused):
         return error.code
-    return next((code for kinds, code in CODES if isinstance(error, kinds)), NO_ANSWER)
+    return next(code for kinds, code in CODES if isinstance(error, kinds))

@@ -388,7 +388,8 @@ async def file(
         fetched = await target.component.fetch_all()
         found = fetched_set(target.component, fetched, source=f"link {target.link.name}")
     if changed:
-        found = select_non_defaults(found, target.defaults_of(found) if at is None else {})
+        metadata = target.metadata if at is None else None
+        found = select_non_defaults(found, {} if metadata is None else metadata.defaults_of(found))
     name = _file_name(target.component, found.at, file_format)
     found, _ = writable(found, file_format)
     data = await anyio.to_thread.run_sync(lambda: dumps(found, file_format=file_format, target=name))
@@ -540,8 +541,7 @@ def _metrics(hub: Hub) -> Iterator[tuple[str, Sequence[tuple[Mapping[str, object
     yield "component_up", [(at, each.sync_state != "lost") for at, each in tables]
     yield "component_synced", [(at, each.sync_state == "synced") for at, each in tables]
     yield "component_parameters", [(at, len(each.params)) for at, each in tables]
-    trips = [(at, each.round_trip) for at, each in tables if each.round_trip is not None]
-    yield "component_round_trip_seconds", trips
+    yield "component_round_trip_seconds", [(at, each.round_trip) for at, each in tables if each.round_trip]
 
     endpoints = [({"endpoint": each.name}, each.stations.values()) for each in hub.gateway.endpoints]
     yield "stations", [(at, len(stations)) for at, stations in endpoints]

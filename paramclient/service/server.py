@@ -127,8 +127,7 @@ def _parse_tokens(text: str, source: str) -> Tokens:
             continue
         found = _LINE.fullmatch(line.strip())
         if found is None:
-            what = "is not NAME read|write sha256:DIGEST; use `paramclient token`"
-            raise UsageError(f"{source}: line {number} {what}")
+            raise UsageError(f"{source}: line {number} is not NAME ROLE sha256:DIGEST of `paramclient token`")
         holder = TokenHolder(found[1], found[2])
         if found[3] in holders or holder.name in {each.name for each in holders.values()}:
             raise UsageError(f"{source}: line {number} repeats a name or a token")
@@ -211,8 +210,7 @@ def _holder_of(scope: Scope, tokens: Tokens | None) -> TokenHolder | None:
             raise ServiceError(401, "unauthorized", "The token is not valid for this service.")
         return holder
     if scope["path"].startswith(PROTECTED):
-        detail = "This service requires a token in the header Authorization: Bearer TOKEN."
-        raise ServiceError(401, "unauthorized", detail)
+        raise ServiceError(401, "unauthorized", "A token is required: Authorization: Bearer TOKEN.")
     return None
 
 
@@ -286,12 +284,10 @@ def listen_at(address: str, *, is_protected: bool) -> tuple[socket.socket, str]:
     """
     found = _ADDRESS.fullmatch(address)
     if found is None or not 0 <= int(found[3] or -1) <= PORT_MAX:
-        what = "is not a listening address HOST:PORT such as 127.0.0.1:8765 or [::1]:0"
-        raise UsageError(f"{address!r} {what}")
+        raise UsageError(f"{address!r} is not HOST:PORT such as 127.0.0.1:8765 or [::1]:0")
     host, family = (found[1], socket.AF_INET6) if found[1] else (found[2], socket.AF_INET)
     if not (is_protected or _is_loopback(host)):
-        what = "is not a loopback address: a service for other computers needs --tokens FILE"
-        raise UsageError(f"{host} {what}")
+        raise UsageError(f"{host} is no loopback address: a service for other computers needs --tokens FILE")
     try:
         opened = socket.create_server((host, int(found[3])), family=family)
     except OSError as error:

@@ -194,8 +194,7 @@ class GroundStation:
         frames: list[bytes] = []
         size = 0
         while len(frames) < FRAMES_PER_DATAGRAM:
-            data = self._held if self._held is not None else self._next_frame()
-            self._held = None
+            data, self._held = self._held or self._next_frame(), None
             if data is None:
                 break
             if frames and size + len(data) > DATAGRAM_SIZE:
