@@ -74,7 +74,7 @@ async def restore(component: Component, state: Wanted, **options: Unpack[ApplyOp
         options: as in `ApplyOptions`.
 
     Raises:
-        UsageError: the state is that of another vehicle.
+        UsageError: the state is that of another vehicle, or the vehicle lacks most of its parameters.
         ParamClientError: as from `apply`.
     """
     state, include = wanted_set(component, state), options.get("include", ())

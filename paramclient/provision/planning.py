@@ -214,6 +214,12 @@ class Plan(Rows):
     awaiting_reboot: tuple[str, ...] = ()
 
     @property
+    def is_for_another(self) -> bool:
+        """Whether the wanted parameters are probably those of another vehicle: this one lacks most of them."""
+        absent = [row for row in self.of(ApplyStatus.REFUSED) if row.category == MISSING]
+        return len(absent) > max(SUGGESTIONS_MAX, len(self.rows) / 2)
+
+    @property
     def firmware_note(self) -> str:
         """The firmware versions of the file and the vehicle, as a sentence; "" unless they differ."""
         return version_difference(*self.firmware) if self.firmware else ""

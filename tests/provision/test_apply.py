@@ -252,6 +252,11 @@ async def test_the_state_of_another_vehicle_is_refused() -> None:
         component = await client.component()
         with pytest.raises(UsageError, match="is that of another vehicle: the ardupilot 616e6f74686572"):
             await restore(component, other.before)
+        unknown = SETTINGS | {f"X_{number}": 1.0 for number in range(50)}
+        with pytest.raises(UsageError, match="most parameters of the state are not on this vehicle"):
+            await restore(component, unknown)
+        with pytest.raises(UsageError, match=r"X_19: not on this vehicle\nand 30 more$"):
+            await apply(component, unknown)
 
 
 async def test_a_vehicle_armed_during_the_run_ends_it() -> None:
