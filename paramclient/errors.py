@@ -36,6 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
+from typing import Final
 
 __all__ = [
     "AlreadyRestored",
@@ -69,6 +70,10 @@ __all__ = [
     "VehicleArmed",
     "VehicleError",
 ]
+
+
+PROBLEMS_SHOWN_MAX: Final = 20
+"""Problems that the text of an error lists: in a file of another vehicle, every name may be one."""
 
 
 class ParamErrorCode(IntEnum):
@@ -175,6 +180,8 @@ class InvalidParameters(UsageError):
 
     def __init__(self, problems: Mapping[str, str]) -> None:
         lines = [f"{name}: {problem}" for name, problem in problems.items()]
+        if (further := len(lines) - PROBLEMS_SHOWN_MAX) > 0:
+            lines[PROBLEMS_SHOWN_MAX:] = [f"and {further} more"]
         super().__init__("nothing was sent, because of these parameters:\n" + "\n".join(lines))
         self.problems = problems
 
@@ -192,12 +199,7 @@ class FileError(UsageError):
     """
 
     def __init__(
-        self,
-        message: str,
-        *,
-        source: str = "",
-        line: int | None = None,
-        more: tuple[str, ...] = (),
+        self, message: str, *, source: str = "", line: int | None = None, more: tuple[str, ...] = ()
     ) -> None:
         place = source if line is None else f"{source}:{line}" if source else f"line {line}"
         super().__init__("\n".join((f"{place}: {message}" if place else message, *more)))

@@ -214,9 +214,8 @@ async def _earlier_state(moment: float | int | None, session: CommandSession) ->
         find = bind(load_restore_point, cache, *place, extended=extended)
         point = await anyio.to_thread.run_sync(find)
     except (errors.CacheError, errors.UnknownVehicle) as error:  # the user named no vehicle of the cache
-        hint = "a backup file can be restored without the cache (--no-cache)"
-        problem = f"nothing was sent, as no earlier state can be read: {error}; {hint}"
-        raise errors.CacheError(problem) from error
+        end = "; a backup file can be restored without the cache (--no-cache)"
+        raise errors.CacheError(f"nothing was sent, as no earlier state can be read: {error}{end}") from error
     when = f"{age_in_words(time.time() - point.at)} ago (snapshot {point.snapshot})"
     changed = listed([*point.changes]) or "nothing, as far as is known"
     say(f"{session.prefix}the state is that before the last apply, {when}; changed since then: {changed}")

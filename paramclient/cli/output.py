@@ -121,11 +121,11 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Non
 
     Args:
         columns: the headings.
-        rows: the cells of each row; None is an empty cell. A column without any cell is left out; one with
-            numbers is aligned at the right.
+        rows: the cells of each row; None is an empty cell. A column without any cell is left out, as is the
+            whole table without rows; a column with numbers is aligned at the right.
     """
     cells, begin = [*rows], 0
-    kept = [column for column in zip(columns, *cells, strict=True) if {*column[1:]} != {None}]
+    kept = [column for column in zip(columns, *cells, strict=True) if {*column[1:]} - {None}]
     lines = [""] * (len(cells) + 1)
     for column in kept:
         texts = ["" if cell is None else printable(str(cell)) for cell in column]
@@ -138,7 +138,8 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Non
             shown, padding = _styled(text, style), " " * (width - len(text))
             lines[at] += (padding + shown if is_number else shown + padding) + GAP
         begin += width + len(GAP)
-    print("\n".join(line.rstrip() for line in lines), flush=True)
+    if kept:
+        print("\n".join(line.rstrip() for line in lines), flush=True)
 
 
 def show(

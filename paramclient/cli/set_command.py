@@ -24,6 +24,7 @@ from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import UnknownParameter, UsageError
 from paramclient.metadata import Metadata
 from paramclient.metadata.info import ParamInfo, number_of
+from paramclient.model.names import is_pattern
 from paramclient.model.values import ParamType, Value, check_name, format_value, parse_ext_value
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 
@@ -84,8 +85,8 @@ def _parse_pairs(words: Sequence[str]) -> dict[str, str]:
         name, equals, text = word.partition("=")
         if not equals and (text := next(left, "")) == "":
             raise UsageError(f"set takes pairs of NAME and VALUE, or NAME=VALUE, and {name} has no value")
-        if check_name(name) in pairs:
-            raise UsageError(f"{name} is given twice")
+        if check_name(name) in pairs or is_pattern(name):
+            raise UsageError(f"{name}: set takes names, no patterns, and each once")
         pairs[name] = text
     if not pairs:
         raise UsageError("set takes pairs of NAME and VALUE, or NAME=VALUE")
@@ -105,8 +106,8 @@ async def _prepare(
     """
     component, job = session.component, SetJob(session, settle, force)
     if not component.is_extended:
-        words = [text for text in texts.values() if number_of(text) is None]
-        needed_for = f"{words[0]!r} is not a number" if words else ""
+        words = [pair for pair in texts.items() if number_of(pair[1]) is None]
+        needed_for = "{}: {!r} is not a number".format(*words[0]) if words else ""
         job.described = await known_of_session(session, choice, needed_for=needed_for)
     for given, text in texts.items():
         name = spelling(given, component)

@@ -123,7 +123,7 @@ def search(
         rows.append((name, value, where, description))
     if options.json:
         print_json({"results": found})
-    elif found:
+    else:
         print_table(["name", "value", "vehicle", "description"], rows)
     if not found:
         say(f"nothing found; {counted(len(known.names), 'parameter')} searched")

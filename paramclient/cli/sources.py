@@ -274,9 +274,8 @@ def _print(found: JsonObject, sides: Mapping[str, ParamSet]) -> None:
         values = [_shown(entry[each]) for each in sides]
         changed = None if found["base"] is None else side or "unknown"
         rows.append([name, *values, entry.get("units"), ", ".join(words), changed])
-    if rows:
-        heads = (f"{side} {address(each)}" if each.system else side for side, each in sides.items())
-        print_table(["name", *heads, "units", "is", "changed"], rows)
+    heads = (f"{side} {address(each)}" if each.system else side for side, each in sides.items())
+    print_table(["name", *heads, "units", "is", "changed"], rows)
 
 
 def _shown(side: JsonObject | None) -> object:

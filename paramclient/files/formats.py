@@ -101,7 +101,7 @@ class ParamFile:
             return fits[0]
         wanted = f"{'any system' if system is None else f'system {system}'}, "
         wanted += "the autopilot" if component is None else f"component {component}"
-        there = ", ".join(map(address, self.sets))
+        there = ", ".join(map(address, self.sets)) + ("; --vehicle chooses one" if fits else "")
         many = "several sets match" if fits else "no set matches"
         raise FileError(f"{many} ({wanted}); the file contains {there}", source=self.source)
 

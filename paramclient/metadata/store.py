@@ -307,7 +307,7 @@ class AddedMetadata:
     path: Path
 
     def __str__(self) -> str:
-        return f"{self.kind} {self.firmware or 'any version'}"
+        return f"{self.kind} {self.firmware or '(any version)'}"
 
 
 class AddedFiles:
@@ -369,7 +369,7 @@ class AddedFiles:
                     raise FileError(f"cannot be removed: {error.strerror}", source=str(each.path)) from error
                 return each
         known = ", ".join(map(str, self)) or "none"
-        raise UsageError(f"no metadata was added for {kind} {firmware or 'any version'}; added: {known}")
+        raise UsageError(f"no metadata was added for {kind} {firmware or '(any version)'}; added: {known}")
 
     def find(self, identity: Identity, component: int) -> Metadata | None:
         """Return the added metadata of a firmware: that with the longest version that fits; None for none.

@@ -144,7 +144,7 @@ def test_a_value_without_a_meaning_on_one_vehicle_is_set_on_the_others(command: 
     done = command("set", put(Air(vehicles)), "COM_FLTMODE1=Return", "--vehicle", "all", "--json")
     assert (done.code, vehicles[0].values["COM_FLTMODE1"]) == (2, 5)
     assert [each["system"] for each in done.json["vehicles"]] == [1]
-    assert "paramclient: 4/1 ardupilot: 'Return' is not a number." in done.err
+    assert "paramclient: 4/1 ardupilot: COM_FLTMODE1: 'Return' is not a number." in done.err
 
 
 def test_set_and_reset_write_to_every_vehicle(command: Command, put: Put, tmp_path: Path) -> None:
