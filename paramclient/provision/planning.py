@@ -215,7 +215,7 @@ class Plan(Rows):
 
     @property
     def is_for_another(self) -> bool:
-        """Whether the wanted parameters are probably those of another vehicle: this one lacks most of them."""
+        """Whether the wanted parameters are probably those of another vehicle: this one lacks most."""
         absent = [row for row in self.of(ApplyStatus.REFUSED) if row.category == MISSING]
         return len(absent) > max(SUGGESTIONS_MAX, len(self.rows) / 2)
 
