@@ -123,7 +123,7 @@ def hint_of_link(station: Station, bytes_received: int) -> str:
         listed = first_of([node_in_words(each) for each in nodes], LISTED_MAX)
         if all(each.identification.vehicle_type == MAV_TYPE_GCS for each in nodes):
             return f"Heard on {link} so far: only {listed}, and no vehicle.{cause}"
-        unnamed = "" if _autopilots(nodes) else " None is an autopilot; one that is named in full is asked."
+        unnamed = "" if _autopilots(nodes) else " None is an autopilot: name one by system and component id."
         return f"Heard on {link} so far: {listed}.{unnamed}"
     if station.frames:
         return f"{counted(station.frames, 'MAVLink frame')} arrived on {link}, but no heartbeat."
