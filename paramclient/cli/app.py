@@ -49,7 +49,7 @@ def run(arguments: Sequence[str]) -> int:
             usage = None
             if isinstance(error, MissingArgumentError):
                 usage = dict(subcommands())[" ".join(error.command_chain or ())].usage
-            report(f"{error} {usage or ''}".rstrip())
+            report(f"{error} {usage or ''}".rstrip().replace("Unused Tokens", "not expected"))
             return ExitCode.USAGE
         except ParamClientError as error:
             report(text_of(error, takes_all=arguments[0] != "signing"))

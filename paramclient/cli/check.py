@@ -97,8 +97,7 @@ async def check(
         return found.code
     print_table(("what", "measured"), found.rows)
     print_line("" if found.findings else "\nNothing slow or unusual.")
-    if found.findings:
-        print_table(("severity", "slow or unusual"), found.findings)
+    print_table(("severity", "slow or unusual"), found.findings)
     return found.code
 
 

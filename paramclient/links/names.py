@@ -129,8 +129,8 @@ def _parse(name: str) -> LinkSpec:
     kind = _SCHEMES.get(scheme[1].lower()) if scheme else None
     if scheme is None or kind is None:
         if "/" in name or ":" not in name or not _HOST_PORT.fullmatch(name):
-            what = f"{scheme[1]!r} is not a kind of link" if scheme else "the kind of link is missing"
-            raise UsageError(what)
+            missing = "the kind of link is missing; a file, or a vehicle in the cache, is no link"
+            raise UsageError(f"{scheme[1]!r} is not a kind of link" if scheme else missing)
         return _network(LinkKind.UDPIN, name)
     rest = scheme[2].removeprefix("//")
     return _PARSERS[kind](rest) if kind in _PARSERS else _network(kind, rest)
