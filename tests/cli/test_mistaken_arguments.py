@@ -27,7 +27,7 @@ NO_VALUE = "set takes pairs of NAME and VALUE, or NAME=VALUE"
         ("set MC_ROLL_P MC_YAW_P 6.5", "link name 'MC_ROLL_P': the kind of link is missing; a file, "),
         ("get 14550 MC_YAW_P", "link name '14550': the kind of link is missing"),
         ("get a\0b MC_YAW_P", "link name 'a\\x00b'"),
-        ("apply sim:px4 fleet.json", "no such file: fleet.json, nor a vehicle in the cache (cache:VEHICLE)\n"),
+        ("apply sim:px4 my.json", "no such file: my.json, nor a vehicle in the cache (cache:VEHICLE)\n"),
         ("cache list 1", "not expected: ['1']"),
         ("set sim:px4", f"{NO_VALUE}\n"),
         ("set sim:px4 MC_ROLL_P = 6.5", f"{NO_VALUE}, and 6.5 has no value\n"),
