@@ -372,7 +372,9 @@ class KeptTable(Stream[Change]):
     def _is_unknown(self, which: Which) -> bool:
         is_beyond = isinstance(which, int) and which not in self.session.table.names
         is_listed = is_beyond and self.list_if_current is not None
-        return is_listed or self._unknown.get(which, -math.inf) > anyio.current_time()
+        is_px4 = self.session.identification.is_px4  # and an ArduPilot takes any case
+        is_misspelt = is_px4 and isinstance(which, str) and self.session.spelled(which) != which
+        return is_listed or is_misspelt or self._unknown.get(which, -math.inf) > anyio.current_time()
 
     async def _read(self, which: Which, turns: anyio.CapacityLimiter) -> None:
         try:
@@ -409,6 +411,8 @@ class KeptTable(Stream[Change]):
         key = newest if newest[:3] == wanted else (*wanted, newest[3] + 1)
         if asker.station.endpoint.is_readonly:
             self._reject([asker], key, ParamErrorCode.READ_ONLY)
+        elif self._is_unknown(message.param_id):
+            self._reject([asker], key, ParamErrorCode.DOES_NOT_EXIST)
         elif self._sets.begins(key, asker):
             self.component.core.spawn(self._set, key, asker)
 
@@ -438,7 +442,8 @@ class KeptTable(Stream[Change]):
             ParamClientError: as from `Component.set`.
         """
         session, is_extended = self.session, self.session.dialect.has_ack
-        name, raw, number, _ = key
+        given, raw, number, _ = key
+        name = session.spelled(given)
         while not is_decoded(session):  # noqa: ASYNC110 - no event for doubt
             await anyio.sleep(PROGRESS_INTERVAL)
         askers, params = self._sets[key], session.table.params
@@ -451,7 +456,7 @@ class KeptTable(Stream[Change]):
         result = await self.component.set(name, value, author=author)
         done = value_of(session, result.param)
         if is_extended:
-            self._say(askers, messages.ParamExtAck(name, done.raw, number, ExtAckResult.ACCEPTED))
+            self._say(askers, messages.ParamExtAck(given, done.raw, number, ExtAckResult.ACCEPTED))
         else:
             self._announce(self, done)
         return ParamErrorCode.NO_ERROR

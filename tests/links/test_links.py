@@ -10,6 +10,7 @@ import struct
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -257,11 +258,8 @@ async def test_an_unknown_host_is_a_link_error(kind: str, monkeypatch: pytest.Mo
 async def test_udpin_sends_to_every_known_vehicle() -> None:
     async with opened("udpin:127.0.0.1:0") as link:
         await link.send(HEARTBEAT, None)
-        with (
-            udp_socket(link.address) as one,
-            udp_socket(link.address) as two,
-            udp_socket(link.address) as odd,
-        ):
+        to = link.address
+        with udp_socket(to) as one, udp_socket(to) as two, udp_socket(to) as odd:
             sent = {one: frame(1), two: frame(1)[7:] + frame(2), odd: bytes(600) + frame(2)}
             for sock, data in sent.items():
                 sock.send(data)
@@ -466,9 +464,7 @@ def reset(sock: socket.socket) -> None:
     sock.close()
 
 
-async def test_tcp_drops_a_peer_that_does_not_read(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_tcp_drops_a_peer_that_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sockets, "SEND_TIMEOUT", 0.05)
     problem = r"the peer has not read any data for 0\.05 s"
     async with connected("tcp") as (link, _), anyio.create_task_group() as tasks:
@@ -494,10 +490,8 @@ async def test_tcpin_continues_when_a_client_disconnects(
     monkeypatch.setattr(selectors, "DefaultSelector", selector)  # the second one is that of Windows
     async with opened("tcpin:127.0.0.1:0") as link:
         await link.send(HEARTBEAT, None)
-        with (
-            socket.create_connection(link.address, timeout=TIMEOUT) as one,
-            socket.create_connection(link.address, timeout=TIMEOUT) as two,
-        ):
+        connect = partial(socket.create_connection, link.address, timeout=TIMEOUT)
+        with connect() as one, connect() as two:
             one.send(frame(1))
             two.send(frame(2))
             peer_of = {data: peer for peer, data in await collect(link, 2)}
@@ -508,7 +502,7 @@ async def test_tcpin_continues_when_a_client_disconnects(
             assert two.recv(1000) == frame(4)
             two.send(frame(5))
             assert await collect(link, 1) == [(peer_of[frame(2)], frame(5))]
-            with socket.create_connection(link.address, timeout=TIMEOUT) as three:
+            with connect() as three:
                 three.send(frame(6))
                 [(peer, data)] = await collect(link, 1)
                 assert data == frame(6)

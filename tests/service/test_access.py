@@ -132,9 +132,8 @@ async def test_no_page_of_another_site_writes_without_tokens() -> None:
         origins = ["null", "http://localhost:3000", "http://127.0.0.1:8765.evil.example", "http://127.0.0.1"]
         for method, address, _ in requests_of(create_app(hub)):
             for origin in origins if method != "GET" else ():
-                answer = await browser.request(
-                    method, address, json=body_for(address), headers={"Origin": origin}
-                )
+                headers, body = {"Origin": origin}, body_for(address)
+                answer = await browser.request(method, address, json=body, headers=headers)
                 problem(answer, 403, "other-origin")
         assert vehicle.param("PARAM_04").value == 4
         own = {"Origin": "http://127.0.0.1:8765"}

@@ -37,8 +37,7 @@ async def test_a_table_is_saved_in_every_format_and_read_again(file_format: File
 
 
 async def test_only_what_differs_from_the_defaults_is_saved() -> None:
-    vehicle = ArduPilotVehicle()
-    async with browsing(vehicle) as browser:
+    async with browsing(vehicle := ArduPilotVehicle()) as browser:
         await browser.patch(f"{V}/params", json={"values": {"RTL_ALT": 2345}})
         answer = await browser.get(f"{V}/file", params={"format": "parm", "changed": "true"})
         lines = [line.split() for line in answer.text.splitlines() if not line.startswith("#")]
@@ -47,8 +46,7 @@ async def test_only_what_differs_from_the_defaults_is_saved() -> None:
 
 
 async def test_a_file_with_a_name_that_no_vehicle_can_have_is_shown_and_not_applied() -> None:
-    vehicle = generic()
-    async with browsing(vehicle) as browser:
+    async with browsing(vehicle := generic()) as browser:
         file = {"name": "a.parm", "text": "PARAM_04 44\nSIM_GPS1_BYTELOSS 0\n"}
         read = (await browser.post("/api/files", json=file)).json()
         assert [list(each["params"]) for each in read["components"]] == [["PARAM_04"]]

@@ -28,12 +28,8 @@ END_TIME = 30.0
 @asynccontextmanager
 async def served(*words: str) -> AsyncIterator[tuple[asyncio.subprocess.Process, httpx.AsyncClient]]:
     """The command in a process of its own, and a client of it."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        *("-m", "paramclient", "serve", *words, "--listen", "127.0.0.1:0"),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    command = (sys.executable, "-m", "paramclient", "serve", *words, "--listen", "127.0.0.1:0")
+    process = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         assert process.stdout is not None
         with anyio.fail_after(TIMEOUT):
@@ -107,9 +103,7 @@ INVALID = ["127.0.0.1", ":80", "::1:80", "[::1]", "host:", "host:x", "host:70000
         (4, ["sim:px4", "--listen", "127.0.0.1:0", "--mavlink", NOT_OURS], NOT_OURS),
     ],
 )
-def test_a_start_that_fails(
-    code: int, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failing_start(code: int, words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     options = [] if {"--cache", "--no-cache"} & set(words) else ["--no-cache"]
     ended = in_process(capsys)("serve", *words, *options)
     assert (ended.code, ended.out) == (code, "")

@@ -80,8 +80,7 @@ async def test_known_parameters_are_selected_by_name_and_pattern() -> None:
 
 
 async def test_a_value_is_written_read_back_and_read_from_the_vehicle() -> None:
-    vehicle = generic()
-    async with browsing(vehicle) as browser:
+    async with browsing(vehicle := generic()) as browser:
         written = (await browser.put(f"{V}/params/PARAM_04", json={"value": 44})).json()
         assert (written["actual"], written["status"]) == (44, "accepted")
         assert vehicle.param("PARAM_04").value == 44
