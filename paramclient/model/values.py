@@ -250,8 +250,8 @@ def check_portable_name(name: str) -> str:
     """
     if not is_portable_name(check_name(name)):
         raise UsageError(
-            f"parameter name {name!r}: no parameter file can hold it, so the client ignores it; a name has"
-            " a letter, no space and none of # , ; = ; it begins with neither @ nor / and does not end with :"
+            f"parameter name {name!r}: no parameter file can hold it; a name has a letter, no space and none"
+            " of # , ; = ; it begins with neither @ nor / and does not end with :"
         )
     return name
 
