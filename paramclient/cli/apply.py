@@ -333,12 +333,15 @@ class _Job:
         """Plan before the deadline of the command, and return the job.
 
         Raises:
+            UsageError: the state to restore is that of another vehicle.
             NoReply: the deadline has passed.
         """
         session, left = self.session, self.session.deadline.left()
         include, info = self.options["include"], self.options["info"]
         with Status(f"reading {session.label}"), anyio.move_on_after(left):
             self.found = made = await plan(session.component, self.state.params, include=include, info=info)
+            if self.state.is_restore:
+                made.check_state()
             is_refused = made.problems and not self.options["partial"]
             is_reboot_due = self.options["reboot"] and made.awaiting_reboot
             self.has_work = not is_refused and bool(made.to_write or is_reboot_due)
@@ -429,6 +432,5 @@ class _Job:
 
 
 def _cells(row: ApplyRow, reason: str) -> Sequence[object]:
-    found = row_json(row)
-    values = map(found.get, ("before", "wanted", "actual"))
+    values = map(row_json(row).get, ("before", "wanted", "actual"))
     return row.name, *values, row.status, reason

@@ -215,8 +215,8 @@ class _Run:
         self._first_plan = self._plan
         if self._plan.problems and not self.options.get("partial"):
             raise InvalidParameters(self._plan.problems)
-        if self.is_restore and self._plan.is_for_another:
-            raise UsageError("nothing was sent: most parameters of the state are not on this vehicle")
+        if self.is_restore:
+            self._plan.check_state()
         before_writing = self.options.get("before_writing")
         if before_writing is not None and (self._plan.to_write or self._must_reboot([])):
             result = before_writing()

@@ -214,12 +214,6 @@ class Plan(Rows):
     awaiting_reboot: tuple[str, ...] = ()
 
     @property
-    def is_for_another(self) -> bool:
-        """Whether the wanted parameters are probably those of another vehicle: this one lacks most."""
-        absent = [row for row in self.of(ApplyStatus.REFUSED) if row.category == MISSING]
-        return len(absent) > max(SUGGESTIONS_MAX, len(self.rows) / 2)
-
-    @property
     def firmware_note(self) -> str:
         """The firmware versions of the file and the vehicle, as a sentence; "" unless they differ."""
         return version_difference(*self.firmware) if self.firmware else ""
@@ -239,6 +233,16 @@ class Plan(Rows):
     def reboot_for(self) -> tuple[str, ...]:
         """The names of values to write that take effect after a reboot."""
         return tuple(row.name for row in self.to_write if row.needs_reboot)
+
+    def check_state(self) -> None:
+        """Check that the wanted parameters may be an earlier state of the vehicle; a file may not name it.
+
+        Raises:
+            UsageError: the vehicle lacks most of them.
+        """
+        absent = [row for row in self.of(ApplyStatus.REFUSED) if row.category == MISSING]
+        if len(absent) > max(SUGGESTIONS_MAX, len(self.rows) / 2):
+            raise UsageError("nothing was sent: most parameters of the state are not on this vehicle")
 
     def __repr__(self) -> str:
         return f"<Plan {self.summary} in {len(self.stages)} stages>"

@@ -257,6 +257,8 @@ def test_restore_reverts_the_last_apply_and_says_what_it_undoes(
     numbered = command("restore", put(vehicle), 1)
     assert (numbered.code, "last apply" in numbered.err) == (0, False)
     assert vehicle.values == copter().values
+    other = file("".join(f"X_{number},1\n" for number in range(50)), "other.param")
+    assert command("restore", put(vehicle), other, "--dry-run").code == 2
 
 
 def test_restore_does_not_undo_an_apply_twice(command: Command, put: Put, file: File) -> None:
