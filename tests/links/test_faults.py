@@ -51,9 +51,7 @@ async def failure(link: Link) -> LinkError:
 
 @pytest.mark.parametrize("reason", GONE)
 @pytest.mark.asyncio
-async def test_a_short_network_outage_loses_only_sent_datagrams(
-    errors: dict[str, list[int]], reason: int
-) -> None:
+async def test_an_outage_loses_only_sent_datagrams(errors: dict[str, list[int]], reason: int) -> None:
     with udp_socket() as vehicle:
         link: Any = create_link(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}")
         await link.open()

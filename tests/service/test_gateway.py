@@ -51,6 +51,7 @@ from tests.shell import PeersLink, Radio, Tap, a_client, bits, generic, small_px
 
 T = TypeVar("T")
 LIST = ParamRequestList(1, 1)
+BURST = Packet(3, 0, Opcode.BURST_READ_FILE, size=239)
 REQUESTS = (ParamRequestList, ParamRequestRead, ParamSet)
 GCS = messages.Heartbeat(6, 8)
 KEY = SigningKey(bytes(range(32)))
@@ -286,6 +287,7 @@ async def test_rule_2_the_parameter_file_in_the_requested_pieces(size: int, quer
         [opened] = await station.ask_file(Opcode.OPEN_FILE_RO, data=path.encode(), session=3, sequence=5)
         assert (opened.opcode, opened.session, opened.sequence) == (Opcode.ACK, 3, 6)
         content = content_of(await station.ask_file(Opcode.BURST_READ_FILE, size=size, session=3))
+        assert max(map(len, station.datagrams)) <= 1_400
         pack = decode(direct_file(path, size))
         rows = [each._replace(default=None) if each.default == each.bits else each for each in pack.entries]
         wanted = encode(rows, total=pack.total, with_defaults=pack.with_defaults, read_size=size)
@@ -548,16 +550,17 @@ async def test_rule_3_a_vehicle_that_is_lost_during_the_fetch_is_served_when_it_
         assert askers(vehicle) <= {254}
 
 
-async def test_rule_3_a_vehicle_that_is_lost_during_an_answer_ends_it() -> None:
-    async with in_sync(PX4Vehicle()) as (served, _, station):
-        station.send(LIST)
-        await anyio.sleep(0.01)
+@pytest.mark.parametrize("request_sent", [LIST, FileTransfer(0, 1, 1, BURST.pack())])
+async def test_rule_3_a_vehicle_that_is_lost_during_an_answer_ends_it(request_sent: messages.Message) -> None:
+    async with in_sync(ArduPilotVehicle()) as (served, _, station):
+        await station.ask_file(Opcode.OPEN_FILE_RO, data=b"@PARAM/param.pck")
+        await station.ask(request_sent, seconds=0.01)
         served.clients[0].core.station.nodes[1, 1].presence.is_lost = True
         await anyio.sleep(0.01)
         received = len(station.frames)
-        assert 0 < received < 903
+        assert 0 < received < 900
         await anyio.sleep(0.5)
-        assert len(station.frames) - received <= 37
+        assert len(station.frames) - received <= 5
 
 
 @pytest.mark.parametrize("is_begun", [False, True])
@@ -706,6 +709,17 @@ async def test_rule_6_queues_are_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
         served.link.is_stuck = False
         await anyio.sleep(0.5)
         assert len(station.frames) <= 20
+
+
+async def test_rule_6_stations_are_bounded_and_silent_ones_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stations, "STATIONS_MAX", 2)
+    async with gateway_over(small_px4()) as served:
+        for each in (partners := [served.partner(system=number) for number in (7, 8, 9)]):
+            await each.ask(GCS)
+        assert [each.sources for each in served.gateway.stations] == [{(8, 190)}, {(9, 190)}]
+        await anyio.sleep(stations.STATION_TIMEOUT)
+        await partners[2].ask(GCS)
+        assert [each.sources for each in served.gateway.stations] == [{(9, 190)}]
 
 
 async def test_rule_6_telemetry_holds_no_list_up() -> None:
@@ -956,7 +970,7 @@ async def test_rule_12_mavlink_1_only_to_a_station_of_it() -> None:
         both.send_bytes(beat)
         both.send(LIST)
         both.send_bytes(beat)
-        await old.ask(LIST)
+        await old.ask(LIST, ParamRequestRead(1, 1, "NONE", -1), seconds=3.0)  # which has a PARAM_ERROR in 2
         assert {each.version for each in old.frames if each.message_id == 22} == {1}
         assert {each.version for each in both.frames if each.message_id == 22} == {2}
         assert len(old.of(ParamValue)) == 26

@@ -40,9 +40,8 @@ def fetch_with_pymavlink(port: int) -> dict[str, float]:
             for index in sorted(missing or ())[:10]:
                 master.mav.param_request_read_send(1, 1, b"", index)
         elif message.param_index < message.param_count:
-            missing = (set(range(message.param_count)) if missing is None else missing) - {
-                message.param_index
-            }
+            missing = set(range(message.param_count)) if missing is None else missing
+            missing.discard(message.param_index)
             raw = struct.pack("<f", message.param_value)
             values[message.param_id] = float(decode_value(raw, message.param_type, encoding)[0])
     return values
