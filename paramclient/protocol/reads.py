@@ -57,12 +57,24 @@ async def read(session: Session, which: str | int) -> ReportedValue:
     if spelled != which:
         with suppress(UnknownParameter, NoReply):
             return await _read(session, spelled, which)
-    known = session.table.params.get(which) if isinstance(which, str) and session.reads_by_index else None
-    if known is not None and known.index is not None:
-        answer = await _read(session, known.index)
-        if answer.param_id == which:
-            return answer
+    known = session.table.params.get(which) if isinstance(which, str) else None
+    if known is not None and known.index is not None and _reads_by_index(session):
+        try:
+            answer = await _read(session, known.index)
+            if answer.param_id == which:
+                return answer
+        except UnknownParameter:
+            session.serves_reads[int] = False
     return await _read(session, which)
+
+
+def _reads_by_index(session: Session) -> bool:
+    """Return whether to read known names by their index.
+
+    An ArduPilot repeats the index in its answer, which tells that from the acknowledgement of a set.
+    """
+    is_told = session.identification.is_ardupilot and session.serves_reads.get(int) is not False
+    return session.reads_by_index or (is_told and session.table.is_complete)
 
 
 async def _read(session: Session, which: str | int, alias: str | int | None = None) -> ReportedValue:

@@ -119,17 +119,15 @@ class _Run(Generic[T]):
 
 @dataclass(slots=True)
 class Replaced:
-    """The values before a change, while an answer to an earlier read may still bring them.
+    """The values before the last acknowledgement, while an answer to an earlier read may still bring them.
 
     Attributes:
-        params: the parameter before the change, and before earlier ones.
-        until: when such an answer can arrive no more. Another value until then is read again.
-        was_other: whether another value was received: it may be a later change.
+        params: the parameter before each change.
+        until: when such an answer can arrive no more.
     """
 
     params: list[Param]
     until: float
-    was_other: bool = False
 
 
 class Session:
@@ -220,23 +218,24 @@ class Session:
             return None
         message = self.typed(message)
         is_other = known is not None and not table.is_reported(known, raw, message.param_type)
+        is_answer = message.param_index != NO_INDEX
         until = table.moments.get(name, -math.inf) + LATE_TIME
         behind = (self._sequences.get(name, sequence) - sequence) % 256
         is_overtaken = may_read and 0 < behind < 128 and now <= until
         if is_overtaken and is_other:
             return until
-        if replaced is not None and now <= replaced.until:
-            if is_other and not is_sent:
-                replaced.was_other = True
+        is_late = replaced is not None and now <= replaced.until
+        if replaced is not None and is_late and is_other:
+            was_it = any(table.is_reported(each, raw, message.param_type) for each in replaced.params)
+            if is_answer or (was_it and not is_sent):
                 return replaced.until
-            if replaced.was_other and not is_other:  # it may have changed back
-                replaced.until, replaced.was_other = now + LATE_TIME, False
         table.store(message, now, is_exact=is_sent)
         if name in table.params and not is_overtaken:
             self._sequences[name] = sequence
-        if known is not None and is_other and may_read and self.identification.is_ardupilot:
-            before = replaced.params if replaced else []
-            self.replaced[name] = Replaced([*before, known][-REPLACED_MAX:], now + LATE_TIME)
+        if known is not None and may_read and self.identification.is_ardupilot and not is_answer:
+            before = replaced.params if replaced is not None and is_late else []
+            params = [*before, known][-REPLACED_MAX:] if is_other else before
+            self.replaced[name] = Replaced(params, now + LATE_TIME)
         return None
 
     def typed(self, message: ReportedValue) -> ReportedValue:

@@ -240,15 +240,16 @@ async def test_changes_are_received_in_their_order(vehicle: Vehicle, reorder: fl
     """A value that others overtake, or that an ArduPilot has kept for a read, is none."""
     name = "BAT1_CAPACITY" if isinstance(vehicle, PX4Vehicle) else "ATC_ANG_RLL_P"
     async with talking(Air([vehicle], downlink=FaultyLink(reorder=reorder))) as (conversation, session):
+        await fetch_all(session)
         for value in range(100):
             async with meanwhile(read(session, name)):
                 vehicle.set_param(name, float(value))
                 await anyio.sleep(0.004)
                 vehicle.set_param(name, value + 0.5)
         await anyio.sleep(1.0)
-        values = [each.new.value for each in conversation.changes if each.new]
+        values = [each.new.value for each in conversation.changes if each.new and each.name == name]
         assert values[1:] == sorted(values[1:])
-        assert values[-1] == 99.5
+        assert (len(values) > 50, values[-1]) == (True, 99.5)
 
 
 async def test_no_set_is_sent_before_the_encoding_is_certain() -> None:

@@ -517,5 +517,5 @@ async def test_twenty_values_over_a_radio_take_one_download_and_are_verified_by_
     assert len({each.sequence for each in packets if each.opcode == Opcode.OPEN_FILE_RO}) == 1
     received = [message for _, _, message in tap.received]
     last = max(place for place, message in enumerate(received) if isinstance(message, messages.ParamSet))
-    read = [each.param_id for each in received[last + 1 :] if isinstance(each, messages.ParamRequestRead)]
-    assert sorted(read) == sorted(wanted)
+    reads = [each for each in received[last + 1 :] if isinstance(each, messages.ParamRequestRead)]
+    assert sorted(vehicle.listed[each.param_index].name for each in reads) == sorted(wanted)
