@@ -271,7 +271,7 @@ class ParamClient:
     ) -> FetchedAll:
         """Update the tables of all components of one system, or of every system on the link."""
 
-    def traffic_report(self) -> TrafficReport:
+    def traffic_report(self, *, is_recent: bool = False) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss."""
 
     def signing_report(self) -> SigningReport | None:

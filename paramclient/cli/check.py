@@ -240,8 +240,7 @@ class _Check:
         client, component = self._client, self._component
         report = client.traffic_report()
         (own,) = (each for each in report.components if (each.system, each.component) == component.address)
-        lost = max(own.totals["lost"], 0)
-        share = lost / max(own.totals["frames"] - own.totals["repeated"] + lost, 1)
+        lost, share = max(own.totals["lost"], 0), own.loss or 0.0
         others = [f"{each.system}/{each.component}" for each in client.autopilots if each is not component]
         self.json["link"] |= {"seconds": round(report.seconds, 3), "loss": round(share, 4), "lost": lost}
         self.json["link"]["autopilots"] = others

@@ -63,7 +63,7 @@ async def link(
         tasks.start_soon(_measure_round_trips, client)
         while left := deadline.left(REFRESH_INTERVAL):
             await anyio.sleep(left)
-            report = client.traffic_report()  # raises if the link has failed
+            report = client.traffic_report(is_recent=is_live)  # raises if the link has failed
             found = _json(client, report)
             if is_live:
                 sys.stdout.write("\x1b[H\x1b[J")  # erases it, for the next table in the same place
@@ -100,7 +100,7 @@ def _json(client: ParamClient, report: TrafficReport) -> JsonObject:
         "link": client.link.name,
         "seconds": round(report.seconds, 3),
         **{f"bytes_{name}": report.totals[name] for name in ("received", "sent")},
-        **{f"{name}_per_s": round(report.recent[name], 1) for name in ("received", "sent")},
+        **{f"{name}_per_s": round(report.rates[name], 1) for name in ("received", "sent")},
         **{name: report.totals[name] for name in ("frames", "unknown")},
         **taken(report, "damaged", "other_bytes"),
         "signing": None if signing is None else taken(signing, *names),
@@ -119,14 +119,14 @@ def _component_json(client: ParamClient, now: float, each: ComponentTraffic) -> 
         "heartbeat_age_s": None if each.heartbeat_at is None else rounded(now - each.heartbeat_at),
         "age_s": rounded(now - each.received_at),
         **{name: each.totals[name] for name in ("frames", "bytes", "lost", "repeated", "late", "signed")},
-        **{f"{name}_per_s": round(each.recent[name], 2) for name in ("frames", "bytes")},
+        **{f"{name}_per_s": round(each.rates[name], 2) for name in ("frames", "bytes")},
         "loss": rounded(each.loss),
         "round_trip_s": component and rounded(component.round_trip),
         "messages": {
             message_name(each_id): {
                 "id": each_id,
                 "count": each.totals[each_id],
-                "per_s": round(each.recent[each_id], 2),
+                "per_s": round(each.rates[each_id], 2),
             }
             for each_id in each.messages
         },

@@ -168,7 +168,7 @@ class CacheWriter:
         self._vehicles[node] = vehicle
         if self.cache is None or (kept is not None and kept.key == identity.key):
             self._identities[node] = identity
-            self._wake()
+            self._something_to_write.set()
             return
         for session in node.sessions:
             is_extended = session is node.extended
@@ -202,7 +202,7 @@ class CacheWriter:
             if is_same_firmware and session.serves_file is None:
                 session.serves_file = cached.file_works
         self._identities[node] = identity
-        self._wake()
+        self._something_to_write.set()
 
     def forget(self, node: Node) -> None:
         """Drop what waits: another vehicle uses the ids of the component."""
@@ -220,14 +220,14 @@ class CacheWriter:
             record.changes.append((change, at))
         else:
             record.is_whole = True
-        self._wake()
+        self._something_to_write.set()
 
     def fetched(self, node: Node, session: Session, *, is_whole: bool) -> None:
         """Take note of a complete fetch; `is_whole`: indices may have changed without values."""
         record = self._record(node, session)
         record.fetched_at = anyio.current_time()
         record.is_whole |= is_whole
-        self._wake()
+        self._something_to_write.set()
 
     def _record(self, node: Node, session: Session) -> TableRecord:
         """Return the record of a table.
@@ -250,7 +250,7 @@ class CacheWriter:
                 await self.write_all()
             except CacheError:
                 await anyio.sleep(RETRY_INTERVAL)
-                self._wake()
+                self._something_to_write.set()
 
     async def write_all(self, *, durable: bool = False) -> None:
         """Write all received values now. Cancellation loses no value.
@@ -289,7 +289,7 @@ class CacheWriter:
                 self._replacements = self.cache.replacements
                 for _, _, record in records:
                     record.is_whole = True
-                self._wake()
+                self._something_to_write.set()
 
     async def write_durably(self, node: Node) -> None:
         """Write all received values, safe from power loss.
@@ -337,9 +337,6 @@ class CacheWriter:
         if not abs(ahead - self._ahead) <= CLOCK_STEP:  # also where the clock is NaN
             self._ahead = ahead
         return self._ahead
-
-    def _wake(self) -> None:
-        self._something_to_write.set()
 
     async def run_in_thread(self, work: Callable[[], T]) -> T:
         """Run a blocking call in the cache's thread after earlier calls. Cancellation does not stop it."""

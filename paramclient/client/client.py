@@ -471,8 +471,11 @@ class ParamClient:
             raise next(iter(silent.values()))
         return FetchedAll(results, silent)
 
-    def traffic_report(self) -> TrafficReport:
+    def traffic_report(self, *, is_recent: bool = False) -> TrafficReport:
         """Return the traffic statistics of the link: components, message rates, packet loss.
+
+        Args:
+            is_recent: whether rates and loss are of the last 5 s, and not of all the time.
 
         Raises:
             UsageError: the client was made without `traffic=True`.
@@ -481,7 +484,7 @@ class ParamClient:
         if self._traffic is None:
             raise UsageError("this client does not count traffic; use ParamClient(..., traffic=True)")
         self.core.station.gate.check()
-        return self._traffic.report(anyio.current_time(), self.core.link_task.cutter)
+        return self._traffic.report(anyio.current_time(), self.core.link_task.cutter, is_recent=is_recent)
 
     def signing_report(self) -> SigningReport | None:
         """Return the signing statistics of the link: signed frames, and refused frames with the reasons.

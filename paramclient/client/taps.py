@@ -282,8 +282,8 @@ def _write(file: FileIO, data: bytearray) -> None:
 # Traffic
 
 RATE_SLICES: Final = 10
-"""Slices over which rates and losses are measured, 5 s: several heartbeats, and short enough to adjust an
-antenna."""
+"""Slices over which recent rates and losses are measured, 5 s: several heartbeats, and short enough to adjust
+an antenna."""
 RATE_SLICE: Final = 0.5
 """Seconds of a slice."""
 RATE_TIME_MIN: Final = 1.0
@@ -312,7 +312,7 @@ class ComponentTraffic:
         totals: since the link was opened: `frames`, `bytes`, `signed` (frames with a signature, which is not
             verified), `lost` (by the gaps in the sequence numbers, see `SequenceCheck`), `repeated`, `late`
             (received after a later frame); and frames by message id.
-        recent: the same per second, of the last seconds.
+        rates: the same per second.
     """
 
     system: int
@@ -323,18 +323,18 @@ class ComponentTraffic:
     heartbeat_at: float | None = None
     radio: Mapping[str, int] | None = None
     totals: Counter[_What] = field(default_factory=Counter)
-    recent: Mapping[_What, float] = field(default_factory=dict)
+    rates: Mapping[_What, float] = field(default_factory=dict)
 
     @property
     def messages(self) -> list[int]:
         """Ids of its messages, the most frequent one first."""
         ids = [what for what in self.totals if isinstance(what, int)]
-        return sorted(ids, key=lambda each: (-self.recent[each], -self.totals[each], each))
+        return sorted(ids, key=lambda each: (-self.rates[each], -self.totals[each], each))
 
     @property
     def loss(self) -> float | None:
-        """The share of its recent frames that was lost, 0 to 1; None without recent frames."""
-        received, lost = self.recent["frames"] - self.recent["repeated"], max(self.recent["lost"], 0.0)
+        """The share of its frames that was lost, 0 to 1; None without frames."""
+        received, lost = self.rates["frames"] - self.rates["repeated"], max(self.rates["lost"], 0.0)
         return lost / (received + lost) if received > 0 else None
 
 
@@ -348,7 +348,7 @@ class TrafficReport:
         components: by address.
         totals: since the link was opened: `received` and `sent` bytes, whole `frames` received, and those of
             them with an `unknown` id.
-        recent: the same per second, of the last seconds.
+        rates: the same per second.
         damaged: frames with a wrong checksum.
         other_bytes: received bytes outside of frames.
     """
@@ -357,7 +357,7 @@ class TrafficReport:
     seconds: float
     components: tuple[ComponentTraffic, ...]
     totals: Counter[_What]
-    recent: Mapping[_What, float]
+    rates: Mapping[_What, float]
     damaged: int
     other_bytes: int
 
@@ -405,26 +405,27 @@ class Traffic(Tap):
         """Count a sent frame."""
         self._count(None, sent=len(frame))
 
-    def report(self, now: float, cutter: FrameCutter) -> TrafficReport:
+    def report(self, now: float, cutter: FrameCutter, *, is_recent: bool) -> TrafficReport:
         """Return the present counts, and those of the cutter of the received data."""
-        first = int(now / RATE_SLICE) - RATE_SLICES + 1
+        first = int(now / RATE_SLICE) - RATE_SLICES + 1 if is_recent else 0
         window = max(now - max(first * RATE_SLICE, self._began), RATE_TIME_MIN)
-        before = next((counts for number, counts in self._before if number >= first), self._counts)
+        slices = (counts for number, counts in self._before if number >= first)
+        before = next(slices, self._counts) if is_recent else Counter[tuple[Address | None, _What]]()
         totals: defaultdict[Address | None, Counter[_What]] = defaultdict(Counter)
-        recent: defaultdict[Address | None, defaultdict[_What, float]]
-        recent = defaultdict(partial(defaultdict, float))
+        rates: defaultdict[Address | None, defaultdict[_What, float]]
+        rates = defaultdict(partial(defaultdict, float))
         for (whose, what), count in self._counts.items():
             totals[whose][what] = count
-            recent[whose][what] = (count - before[whose, what]) / window
+            rates[whose][what] = (count - before[whose, what]) / window
         return TrafficReport(
             at=now,
             seconds=now - self._began,
             components=tuple(
-                replace(each, totals=totals[address], recent=recent[address])
+                replace(each, totals=totals[address], rates=rates[address])
                 for address, each in sorted(self._components.items())
             ),
             totals=totals[None],
-            recent=recent[None],
+            rates=rates[None],
             damaged=cutter.damaged,
             other_bytes=cutter.other_bytes,
         )
