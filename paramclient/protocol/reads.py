@@ -64,7 +64,7 @@ async def read(session: Session, which: str | int) -> ReportedValue:
             if answer.param_id == which:
                 return answer
         except UnknownParameter:
-            session.serves_reads[int] = False
+            session.serves_reads.setdefault(int, False)
     return await _read(session, which)
 
 
@@ -239,7 +239,8 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
     """
     live = {name: param.index for name, param in session.table.params.items() if param.trust is Trust.LIVE}
     same = live.pop(which, None) if isinstance(which, str) else None
-    likely = next(iter(live), 1) if same is None else same
+    known: Iterable[str | int | None] = live.values() if _reads_by_index(session) else live
+    likely = next(filter(None, known), 1) if same is None else same
     control = await _try(session, likely) or await _try(session, 0)  # the indices may be 0, 2, 4, …
     is_proven = not isinstance(which, str) or session.serves_reads.get(str)
     if control is None or is_proven or control.param_id == which:
