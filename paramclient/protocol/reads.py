@@ -239,8 +239,8 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
     """
     live = {name: param.index for name, param in session.table.params.items() if param.trust is Trust.LIVE}
     same = live.pop(which, None) if isinstance(which, str) else None
-    known: Iterable[str | int | None] = live.values() if _reads_by_index(session) else live
-    likely = next(filter(None, known), 1) if same is None else same
+    known: Iterable[str | int | None] = live.values() if _reads_by_index(session) else [*live]
+    likely: str | int = next((each for each in known if each), 1) if same is None else same
     control = await _try(session, likely) or await _try(session, 0)  # the indices may be 0, 2, 4, …
     is_proven = not isinstance(which, str) or session.serves_reads.get(str)
     if control is None or is_proven or control.param_id == which:
