@@ -38,8 +38,8 @@ STATION_TIMEOUT: Final = 60.0
 STATIONS_MAX: Final = 64
 """Stations of one endpoint, at most; the one that was silent for longest is forgotten first."""
 NOISE_MAX: Final = 4_096
-"""Bytes outside of frames, of one sender and in one second, after which its others are dropped unread: a
-flood of noise delays no other station. Data is read in pieces of as many."""
+"""Bytes outside of frames and whole frames, of one sender and in one second, after which its others are
+dropped unread: no flood delays other stations. Data is read in pieces of as many bytes."""
 REQUESTS_MAX: Final = 200
 """Requests of one station that wait for a vehicle or a fetch, at most; further ones are dropped, as on a full
 link."""
@@ -360,7 +360,7 @@ class MavlinkEndpoint:
     async def _read(self, take: Take, tasks: anyio.abc.TaskGroup) -> None:
         """Receive frames until the link fails."""
         cutter = FrameCutter(stream=self.link.is_stream)
-        noise: Counter[Peer] = Counter()  # bytes outside of frames, since
+        noise: Counter[Peer] = Counter()  # bytes outside of frames, and frames, since
         since = anyio.current_time()
         while True:
             received = await self.link.receive()
@@ -370,7 +370,7 @@ class MavlinkEndpoint:
                 for at in range(0, len(chunk) or 1, NOISE_MAX):
                     data = chunk[at : at + NOISE_MAX]
                     for seen in cutter.cut(data, peer) if noise[peer] < NOISE_MAX else ():
-                        noise[peer] -= seen.size
+                        noise[peer] += 1 - seen.size
                         if self._accepts(seen.data):
                             station = self._station(peer if self._listens else None, tasks)
                             station.received(seen)

@@ -95,8 +95,7 @@ async def test_snapshots_are_stored_listed_read_and_applied(cache: str) -> None:
         assert made.json() == kept
         assert (kept["reason"], kept["size"], kept["complete"]) == ("before the flight", 25, True)
         query = {"at": kept["id"]}
-        params = (await browser.get(f"{V}/params", params=query)).json()["params"]
-        assert params["PARAM_04"]["value"] == 4
+        assert (await browser.get(f"{V}/params", params=query)).json()["params"]["PARAM_04"]["value"] == 4
         assert "PARAM_04\t4\t" in (await browser.get(f"{V}/file", params=query)).text
         plan = (await browser.post(f"{V}/plan", json=query)).json()
         assert [name for name, each in plan["params"].items() if each["status"] == "set"] == ["PARAM_04"]
@@ -115,8 +114,7 @@ async def test_history_has_changes_of_all_or_of_one_name(cache: str) -> None:
         assert [(each["old"], each["new"]) for each in of_one] == [(9, 7)]
         since = (await browser.get(f"{V}/history", params={"since": lines[1]["time"]})).json()["history"]
         assert since == lines[1:]
-        at = {"at": lines[1]["time"]}
-        before = (await browser.get(f"{V}/params", params=at)).json()["params"]
+        before = (await browser.get(f"{V}/params", params={"at": lines[1]["time"]})).json()["params"]
         assert before["PARAM_04"]["value"] == 9
 
 

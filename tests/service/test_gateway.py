@@ -1141,15 +1141,17 @@ async def test_a_station_that_floods_and_one_that_sends_garbage() -> None:
         flood, garbage = served.partner(system=7), served.partner(system=8)
         noise, tasks = random.Random(1), len(anyio.get_running_tasks())
         for number in range(90):
-            opening = Packet(1, number, Opcode.OPEN_FILE_RO, b"a.txt")
-            flood.send(FileTransfer(0, 1, 1, opening.pack()), *[LIST] * 30)
+            opening = partial(Packet, 1, opcode=Opcode.OPEN_FILE_RO, data=b"a.txt")
+            opened = [opening(session=(3 * number + each) % 256) for each in range(3)]
+            flood.send(*(FileTransfer(0, 1, 1, each.pack()) for each in opened), *[LIST] * 30)
             flood.send(*[ParamRequestRead(1, 1, f"N{number}", -1)] * 20)
             flood.send(*(ParamRequestRead(1, 1, "", index) for index in range(900, 950)))
             flood.send(*(set_to("MC_PITCH_P", number + each / 64, ParamType.REAL32) for each in range(60)))
             for piece in (noise.randbytes(500), *[b"\xfd" * 500] * 9):
                 garbage.send_bytes(piece)
             await anyio.sleep(0.01)
-        garbage.send(messages.CommandLong(1, 1, 400))  # dropped unread, as what follows noise in a second
+        for each in (flood, garbage):
+            each.send(messages.CommandLong(1, 1, 400))  # dropped unread, as all of a flood in this second
         assert len(anyio.get_running_tasks()) <= tasks + stations.REQUESTS_MAX + 20
         asked = set_to("MC_ROLL_P", 3, ParamType.REAL32), ParamRequestRead(1, 1, "UNKNOWN", -1)
         await station.ask(LIST, *asked, seconds=1.5)
