@@ -222,7 +222,7 @@ class Session:
         until = table.moments.get(name, -math.inf) + LATE_TIME
         behind = (self._sequences.get(name, sequence) - sequence) % 256
         is_overtaken = may_read and 0 < behind < 128 and now <= until
-        if is_overtaken and is_other:
+        if is_overtaken and is_other and not is_sent:
             return until
         is_late = replaced is not None and now <= replaced.until
         if replaced is not None and is_late and is_other:
