@@ -1,14 +1,13 @@
 """ArduPilot's answer to "is the table current?": the checksum of its parameter file.
 
-MAVFTP's CalcFileCRC32 returns the CRC-32 of `@PARAM/param.pck`, of all parameters or of the first ones, in
+MAVFTP's CalcFileCRC32 returns the CRC-32 of `@PARAM/param.pck`, of all parameters or of a range of them, in
 one round trip and without opening the file. The same file is encoded from the table. The checksum is linear:
-the difference of two of them depends only on the bytes that differ. So two of them show whether the rows
-between their ends differ. Where one value does, its new bits follow from each row in which it may be, and the
-row in which these are a simple value is probably the one.
+where one value of a range differs, its new bits follow from each row in which it may be, and the row in which
+these are a simple value is probably the one.
 
 Such a value can also make up for other changes, and no checksum would show it. So each is read by its index
-too, but for those that always move: their rows are compared alone. Nothing is taken over until the checksum
-of the whole file agrees.
+too, but for those that always move: their rows are compared alone. Nothing is taken over until the checksums
+of all ranges agree.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterator
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from typing import Final
 
 import anyio
@@ -37,12 +36,12 @@ AT_ONCE: Final = 5
 """Requests sent at once: ArduPilot queues no more of them (GCS_FTP.cpp)."""
 INTERVAL_FIRST: Final = 0.020
 """Seconds from these to the next request: a Plane and a Rover look for requests every 20 ms."""
-OUTDATED: Final = 0.1
-"""Seconds after which a checksum is requested again with the next ones: a pressure changes every second."""
+SCATTERED: Final = 0.1
+"""Seconds between answers in which a value that always moves may have done so."""
 INTERVAL: Final = 0.006
 """Seconds between further requests: ArduPilot loses some of those sent every 4 ms (measured)."""
-REQUEST_SIZE: Final = 54
-"""Bytes of a request on the link."""
+REQUEST_SIZE: Final = 65
+"""Bytes of a request on the link, for a range."""
 FILE_ROUND_TRIPS: Final = 3
 """Round trips of a download: to open the file, to its first block, and to close it."""
 FILE_RATE: Final = 48_500
@@ -70,7 +69,9 @@ OFTEN_MAX: Final = 8
 TOO_MANY: Final = "it differs, and a download is quicker than a search for the changes"
 OTHER: Final = "the vehicle has other parameters than the cached table, or changes them all the time"
 PROOFS_MAX: Final = 2
-"""Proofs: the vehicle may change a value in the middle of one."""
+"""Proofs: the table may change in the middle of one."""
+REPEATS_MAX: Final = 3
+"""Checksums of single values that are requested again, as these may just have moved."""
 PARTS_MIN: Final = 3
 PARTS_MAX: Final = 12
 """Parts into which a range that differs is divided."""
@@ -105,10 +106,10 @@ async def prove(session: Session) -> None:
         try:
             for _ in range(PROOFS_MAX):
                 proof = _Proof(session, _rows(session.table))
-                is_proven = await proof.run()
+                await proof.run()
                 if session.identification.vehicles != vehicles:
                     raise FileUnavailable("another vehicle has taken the address")
-                if is_proven and proof.take_over():
+                if proof.take_over():
                     return
         except FileTransferError as error:
             if error.code == FileErrorCode.UNKNOWN_COMMAND:
@@ -127,93 +128,86 @@ def is_moving(name: str) -> bool:
 
 
 class _Proof:
-    """One proof: the file as the vehicle must have it, which is brought in line with its checksums."""
+    """One proof: the rows as the vehicle must have them, which are brought in line with its checksums."""
 
     def __init__(self, session: Session, rows: list[PackedParam]) -> None:
         self._session = session
         self._rows = rows
-        entries = [b"", *encode_entries(rows, with_defaults=False, read_size=CHECKED_READ_SIZE)]
-        self._content = b"".join(entries)  # behind the header
-        self._ends = list(accumulate(map(len, entries)))  # of the first rows, by their number
-        self._found: dict[int, int] = {}  # the vehicle's checksum of the first rows, by their number
-        self._times: dict[int, tuple[float, float]] = {}  # when it was first requested, and answered
+        self._found: dict[range, int] = {}  # the vehicle's checksums of ranges, which may differ
+        self._encoded: dict[range, list[bytes]] = {}  # the rows of a range, behind its header
         self._changed: dict[int, float] = {}  # by index, when the value was known
         self._refuted: set[tuple[int, int]] = set()  # wrong guesses
         self._round_trip = math.inf  # of the quickest requests
+        self._is_scattered = False  # the latest checksums
         self._byte_time = 0.0  # seconds for each byte of requests that waited for each other
 
-    async def run(self) -> bool:
-        """Compare, and read what differs, until nothing does; return False if values may just have moved.
+    async def run(self) -> None:
+        """Compare, and read what differs, until nothing does.
 
         Raises:
             TableDiffers: the tables are too different.
         """
-        rows, volatile = self._rows, self._session.table.volatile
-        whole = range(len(rows))
+        rows, table, now = self._rows, self._session.table, anyio.current_time()
+        whole, repeats = range(len(rows)), 0
         always: set[int] = set()
         if self._session.identification.vehicle_type in PLANES_AND_ROVERS:
             always = {at for at, row in enumerate(rows) if row.bits and PRESSURE.fullmatch(row.name)}
-        seconds = {at for at, row in enumerate(rows) if SECONDS.fullmatch(row.name)}
-        often = {at for at, row in enumerate(rows) if row.name in volatile} - always - seconds
+        seconds = {at for at, row in enumerate(rows) if row.bits and SECONDS.fullmatch(row.name)}
+        often = {at for at, row in enumerate(rows) if row.name in table.volatile}
         rare = {at for at, row in enumerate(rows) if row.name == BOOT_COUNT or may_be_rounded(row)}
+        is_first = any(param.trust is Trust.CACHED for param in table.params.values())
+        is_slow = is_first and (self._session.channel.timing.round_trip or 0.0) > SLOW_ROUND_TRIP
+        alone = always | ({0} if is_slow else set())  # this one shows the count
+        if is_first:
+            alone |= {at for at in seconds if now - table.moments[rows[at].name] >= 1}
+        first = {whole, *(range(at, at + 1) for at in alone)}
+        await self._request(first)
         suspects: set[int] = set()
-        may_repeat = bool(always)
-        numbers = {len(whole)} | (self._ends_of(always, whole) or ({1} if self._is_slow else set()))
-        await self._request(numbers)  # the first rows show whether the count in the header is another
-        while places := self._places():
+        while places := self._differing():
+            if len(places) > 1:
+                places.pop(whole, None)  # its parts say more
+            moved: dict[int, int] = {}
+            for place, difference in places.items():
+                moved |= self._guess_moved(place, difference)
+            for at, bits in moved.items():
+                self._take(at, bits, anyio.current_time())
+            if moved:
+                continue
+            if always and self._is_scattered and not repeats and whole in places:
+                repeats += 1
+                await self._request(first)
+                continue
             if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
-                suspects = {at for at in whole if MEASURED.fullmatch(rows[at].name) and rows[at].bits}
+                suspects = {at for at, row in enumerate(rows) if MEASURED.fullmatch(row.name) and row.bits}
+            known = {place.start for place in self._found.keys() - places if len(place) == 1}
+            is_other = not self._found.keys() - places - {whole}
             guesses: dict[int, int] = {}
-            numbers = set()
+            parts: set[range] = set()
             divided: list[range] = []
             for place, difference in places.items():
-                if moved := self._guess_moved(place, difference):
-                    self._take(*moved, anyio.current_time())
-                elif len(place) > 1 and (suspected := suspects.intersection(place)):
+                if len(place) > 1 and (suspected := suspects.intersection(place)):
                     guesses |= {at: rows[at].bits for at in suspected}
                 elif guess := self._guess(place, difference):
                     guesses |= guess
-                elif ends := self._ends_of(always | often | seconds | rare, place):
-                    numbers |= ends | (self._divide(place) if self._is_slow else set())
                 elif len(place) > 1:
-                    numbers |= self._divide(place)
-                    divided.append(place)
-                elif len(places) == len(self._found):
+                    apart = always | ((seconds | often | rare) - known)
+                    ends = {end for at in apart for end in (at, at + 1)}.intersection(place[1:])
+                    if not ends:
+                        divided.append(place)
+                    ends |= self._divide(place)
+                    parts |= {range(*each) for each in pairwise((place.start, *sorted(ends), place.stop))}
+                    del self._found[place]
+                elif is_other or repeats == REPEATS_MAX:
                     raise TableDiffers(OTHER)
                 else:
-                    return False
-            answered = [self._times[number][1] for number in self._found]
-            if may_repeat and numbers and max(answered) - min(answered) > OUTDATED:
-                numbers, may_repeat = set(self._found), False  # a pressure may have moved in between
-            else:
-                self._weigh(len(guesses), len(numbers), divided)
-            if numbers:
-                numbers |= self._forget_outdated(places)
-                await self._request(numbers | self._ends_of(always, whole))
+                    parts.add(place)
+                    repeats += 1
+            self._weigh(len(guesses), len(parts), divided)
+            if parts:
+                await self._request(parts)
             elif guesses:
                 await self._read(guesses)
                 suspects -= guesses.keys()
-        return True
-
-    @property
-    def _is_slow(self) -> bool:
-        """Whether round trips count more than bytes, for a table that was not proven on this link."""
-        channel, params = self._session.channel, self._session.table.params.values()
-        is_slow = (channel.timing.round_trip or 0.0) > SLOW_ROUND_TRIP
-        return is_slow and any(param.trust is Trust.CACHED for param in params)
-
-    def _ends_of(self, indices: Collection[int], place: range) -> set[int]:
-        """Return the numbers of rows whose checksums show these values, as far as they are in a range and not
-        known."""
-        return {end for at in indices if at in place for end in (at, at + 1)} - {0, *self._found}
-
-    def _forget_outdated(self, places: Collection[range]) -> set[int]:
-        """Forget checksums that may be of other values than the next ones, and return those still needed."""
-        needed = {len(self._rows)}.union(*((place.start, place.stop) for place in places))
-        since = anyio.current_time() - OUTDATED
-        outdated = {number for number in self._found if self._times[number][0] < since}
-        self._found = {number: found for number, found in self._found.items() if number not in outdated}
-        return outdated & needed
 
     @property
     def _parts(self) -> int:
@@ -223,49 +217,52 @@ class _Proof:
         size = -(-len(place) // self._parts)
         return set(range(place.start + size, place.stop, size))
 
-    def _places(self) -> dict[range, int]:
-        """Return the ranges that differ, between the rows of known checksums, with the difference."""
-        places = {}
-        before = 0
-        for start, stop in pairwise([0, *sorted(self._found)]):
-            head = crc32_px4(header(stop, len(self._rows)))
-            now = self._found[stop] ^ crc32_px4(self._content[: self._ends[stop]], head)
-            difference = now ^ crc32_px4(bytes(self._ends[stop] - self._ends[start]), before)
-            before = now
-            if difference:
-                places[range(start, stop)] = difference
-        return places
+    def _entries(self, place: range) -> list[bytes]:
+        if place not in self._encoded:
+            rows = self._rows[place.start : place.stop]
+            entries = encode_entries(rows, with_defaults=False, read_size=CHECKED_READ_SIZE)
+            self._encoded[place] = list(entries)
+        return self._encoded[place]
+
+    def _checksum(self, place: range) -> int:
+        return crc32_px4(b"".join((header(len(place), len(self._rows)), *self._entries(place))))
+
+    def _differing(self) -> dict[range, int]:
+        """Return the ranges whose checksums differ, with the difference."""
+        differences = {place: found ^ self._checksum(place) for place, found in self._found.items()}
+        return {place: difference for place, difference in differences.items() if difference}
 
     def _explanations(self, place: range, difference: int) -> Iterator[tuple[int, int]]:
         """Yield each index in a range, from the last, with the bits of a value that explains a difference
-        alone."""
-        for at in reversed(place):
-            row = self._rows[at]
-            change = crc32_px4_before(difference, row.type.size)
-            if not change >> 8 * row.type.size and (at, row.bits ^ change) not in self._refuted:
-                yield at, row.bits ^ change
-            difference = crc32_px4_before(difference, self._ends[at + 1] - self._ends[at])
-
-    def _guess_moved(self, place: range, difference: int) -> tuple[int, int] | None:
-        """Return the index and the bits of a value that has just moved as it always does, and explains a
-        difference alone: hardly anything else explains it, so that it needs no read."""
-        moments, now = self._session.table.moments, anyio.current_time()
-        answered = [self._times[number][1] for number in (place.start, place.stop) if number]
-        is_prompt = max(answered) - min(answered) < OUTDATED  # else the place may hold changes of other rows
-        for at, bits in self._explanations(place, difference):
-            row = self._rows[at]
-            passed = now - moments.get(row.name, now)
-            if _has_just_moved(row, bits, passed, is_alone=len(place) == 1, is_prompt=is_prompt):
-                return at, bits
-        return None
-
-    def _guess(self, place: range, difference: int) -> dict[int, int]:
-        """Return the index and the bits of the simplest value that explains a difference alone, unless there
-        is none, or it may be chance.
+        alone.
 
         Raises:
             TableDiffers: the number of parameters in the header explains it.
         """
+        for at, entry in zip(reversed(place), reversed(self._entries(place)), strict=True):
+            row = self._rows[at]
+            change = crc32_px4_before(difference, row.type.size)
+            if not change >> 8 * row.type.size and (at, row.bits ^ change) not in self._refuted:
+                yield at, row.bits ^ change
+            difference = crc32_px4_before(difference, len(entry))
+        if place.start == 0 and not crc32_px4_before(difference, 2) >> 16:
+            raise TableDiffers(OTHER)
+
+    def _guess_moved(self, place: range, difference: int) -> dict[int, int]:
+        """Return the index and the bits of a value, alone in its range, that has just moved as it always
+        does: hardly anything else explains it, so that it needs no read."""
+        moments, now = self._session.table.moments, anyio.current_time()
+        if len(place) > 1:
+            return {}
+        return {
+            at: bits
+            for at, bits in self._explanations(place, difference)
+            if _has_just_moved(self._rows[at], bits, now - moments.get(self._rows[at].name, now))
+        }
+
+    def _guess(self, place: range, difference: int) -> dict[int, int]:
+        """Return the index and the bits of the simplest value that explains a difference alone, unless there
+        is none, or it may be chance."""
         guess: dict[int, int] = {}
         bits = GUESS_BITS_SHORT if len(place) <= PARTS_MAX else GUESS_BITS
         bits_max = bits - math.log2(len(place)) if len(place) > 1 else math.inf
@@ -273,8 +270,6 @@ class _Proof:
             size = _bits_to_write(value, self._rows[at].type)
             if size <= bits_max:
                 guess, bits_max = {at: value}, size
-        if place.start == 0 and not crc32_px4_before(difference, self._ends[place.stop] + 2) >> 16:
-            raise TableDiffers(OTHER)
         return guess
 
     def _weigh(self, reads: int, requests: int, divided: list[range]) -> None:
@@ -291,34 +286,37 @@ class _Proof:
         is_narrow = 2 * largest < len(self._rows) and 2 * len(divided) > reads
         depths = [math.ceil(math.log(len(each), parts)) if is_narrow else 1 for each in divided]
         rounds = max(depths, default=bool(requests))
-        requests += (parts - 1) * (sum(depths) - len(depths))
+        requests += parts * (sum(depths) - len(depths))
         slots = 0.5 + reads // READS_PER_SLOT_ARDUPILOT
         search = (rounds + 1) * trip + requests * INTERVAL + slots * SLOT_ARDUPILOT
         byte_time = max(1 / FILE_RATE, self._byte_time)
-        if search > FILE_ROUND_TRIPS * trip + byte_time * len(self._content):
+        size = sum(map(len, self._entries(range(len(self._rows)))))
+        if search > FILE_ROUND_TRIPS * trip + byte_time * size:
             raise TableDiffers(TOO_MANY)
 
-    async def _request(self, numbers: Collection[int]) -> None:
-        """Request the vehicle's checksums of the first rows, by their numbers."""
-        session = self._session
+    async def _request(self, places: Collection[range]) -> None:
+        """Request the vehicle's checksums of ranges."""
+        session, whole = self._session, range(len(self._rows))
         attempts = session.ftp_attempts()
+        ranges = sorted(places, key=len, reverse=True)
+        answered: list[float] = []
 
-        async def request(number: int) -> None:
-            asked_at = anyio.current_time()
-            query = "" if number == len(self._rows) else f"?count={number}"
-            answer = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
-            self._found[number], self._times[number] = answer, (asked_at, anyio.current_time())
+        async def request(place: range) -> None:
+            query = "" if place == whole else f"?start={place.start}&count={len(place)}"
+            self._found[place] = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
+            answered.append(anyio.current_time())
 
         async with task_group() as tasks:
-            for place, number in enumerate(sorted(numbers, reverse=True)):
-                if place >= AT_ONCE:
-                    await anyio.sleep(INTERVAL if place > AT_ONCE else INTERVAL_FIRST)
-                tasks.start_soon(request, number)
+            for number, place in enumerate(ranges):
+                if number >= AT_ONCE:
+                    await anyio.sleep(INTERVAL if number > AT_ONCE else INTERVAL_FIRST)
+                tasks.start_soon(request, place)
             sent_at = anyio.current_time()
         session.serves_checksum = True
+        self._is_scattered = max(answered) - min(answered) > SCATTERED
         elapsed = anyio.current_time() - sent_at
         self._round_trip = min(self._round_trip, elapsed)
-        self._byte_time = (elapsed - self._round_trip) / (REQUEST_SIZE * len(numbers))
+        self._byte_time = (elapsed - self._round_trip) / (REQUEST_SIZE * len(ranges))
 
     async def _read(self, guesses: dict[int, int]) -> None:
         """Read values by their indices, and take over those that are others; `guesses` has their exact bits.
@@ -348,11 +346,12 @@ class _Proof:
                 tasks.start_soon(read_one, at, guess)
 
     def _take(self, at: int, bits: int, now: float) -> None:
-        row, end = self._rows[at], self._ends[at + 1]
-        if bits != row.bits:
+        if bits != self._rows[at].bits:
+            row = self._rows[at] = self._rows[at]._replace(bits=bits)
             value = bits.to_bytes(row.type.size, "little")
-            self._rows[at] = row._replace(bits=bits)
-            self._content = self._content[: end - len(value)] + value + self._content[end:]
+            for place, entries in self._encoded.items():
+                if at in place:
+                    entries[at - place.start] = entries[at - place.start][: -len(value)] + value
             self._changed[at] = now
 
     def take_over(self) -> bool:
@@ -371,19 +370,19 @@ class _Proof:
         names = {self._rows[at].name for at in self._changed}
         if names and len(names) <= OFTEN_MAX:
             table.volatile = frozenset(name for name in names if not MEASURED_ONCE.fullmatch(name))
-        table.prove(self._found[len(self._rows)])
+        table.prove(self._checksum(range(len(self._rows))))
         return True
 
 
-def _has_just_moved(row: PackedParam, bits: int, passed: float, *, is_alone: bool, is_prompt: bool) -> bool:
-    """Return whether a value has grown by the seconds that have passed; or, where nothing else can have
-    changed, by fewer of them, as the vehicle was off meanwhile, or is the same day's pressure."""
+def _has_just_moved(row: PackedParam, bits: int, passed: float) -> bool:
+    """Return whether a value has grown by the seconds that have passed, or by fewer of them, as the vehicle
+    was off meanwhile; or is the same day's pressure."""
     old, new = float(from_bits(row.bits, row.type)), float(from_bits(bits, row.type))
     if SECONDS.fullmatch(row.name) and row.type is ParamType.INT32:
-        fewest = 1 if is_alone and is_prompt and passed <= PASSED_MAX else passed - SECONDS_SLACK
+        fewest = 1 if passed <= PASSED_MAX else passed - SECONDS_SLACK
         return new > old and fewest <= new - old <= passed + SECONDS_SLACK
     is_pressure = PRESSURE.fullmatch(row.name) and row.type is ParamType.REAL32
-    return bool(is_pressure) and is_alone and 0 < abs(new - old) <= PRESSURE_DRIFT * old
+    return bool(is_pressure) and 0 < abs(new - old) <= PRESSURE_DRIFT * old
 
 
 def _bits_to_write(bits: int, kind: ParamType) -> float:

@@ -81,6 +81,7 @@ async def test_an_unchanged_table_costs_one_request_and_opens_nothing() -> None:
 @virtual
 async def test_seconds_that_were_counted_need_no_read(delay: float, seconds: float, passed: int) -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
+    vehicle.load({"STAT_RUNTIME": 600})
     cached = vehicle.params
     async with converse(Air.symmetric([vehicle], delay=delay)) as conversation:
         node = await with_cached_table(conversation, cached)
@@ -97,6 +98,7 @@ async def test_seconds_that_were_counted_need_no_read(delay: float, seconds: flo
 @virtual
 async def test_pressure_that_a_rover_measures_all_the_time_needs_no_read() -> None:
     vehicle = ArduPilotVehicle(kind="rover", live_period=0.0)
+    vehicle.load({"STAT_RUNTIME": 600})
     async with converse(Air.symmetric([vehicle], delay=0.004)) as conversation:
         node = await with_cached_table(conversation, vehicle.params)
         for step, reads in ((0.5, 0), (1.25, 0), (-3.5, 0), (4000.0, 2)):
@@ -104,6 +106,7 @@ async def test_pressure_that_a_rover_measures_all_the_time_needs_no_read() -> No
                 {n: float(vehicle.param(n).value) + step for n in ("BARO1_GND_PRESS", "BARO2_GND_PRESS")}
             )
             vehicle.load({"STAT_RUNTIME": int(vehicle.param("STAT_RUNTIME").value) + 30})
+            await anyio.sleep(30)
             node.plain.table.doubt()
             sent = len(conversation.sent)
             result = await fetch_all(node.plain)
@@ -132,7 +135,7 @@ async def test_a_value_that_moves_between_two_requests_starts_no_search() -> Non
         assert len(opcodes(conversation)) <= 6
 
 
-@pytest.mark.parametrize(("after", "is_lost"), [(0, False), (1, False), (2, False), (1, True)])
+@pytest.mark.parametrize(("after", "is_lost"), [(0, False), (1, False), (1, True)])
 @virtual
 async def test_pressure_that_moves_between_requests_costs_a_round_trip(after: int, is_lost: bool) -> None:
     vehicle = ArduPilotVehicle(kind="rover", live_period=0.0)
@@ -153,42 +156,6 @@ async def test_pressure_that_moves_between_requests_costs_a_round_trip(after: in
         check(vehicle, node, result)
         assert anyio.current_time() - began < 0.35 + 0.2 * is_lost
         assert not is_lost or len(set(conversation.sent_of(FileTransfer))) <= 10
-
-
-@virtual
-async def test_a_set_between_an_answer_and_a_repeated_one_is_not_taken_for_run_time() -> None:
-    """By the checksums before and behind STAT_RUNTIME, it would be 17,204 s, and nothing else changed."""
-    vehicle = ArduPilotVehicle(live_period=0.0)
-    cached = vehicle.params
-    place = [param.name for param in vehicle.listed].index("STAT_RUNTIME")
-    lost = {"", f"?count={place + 1}"}
-    requests: dict[int, str] = {}
-
-    def up(message: Message) -> bool:
-        if isinstance(message, FileTransfer):
-            packet = Packet.unpack(message.payload)
-            query = packet.data.decode().partition("param.pck")[2]
-            if query and query in requests.values():  # it was lost
-                vehicle.load({"PLDP_SPEED_DN": -6.6})
-            requests[packet.sequence + 1] = query
-        return True
-
-    def down(message: Message) -> bool:
-        if not isinstance(message, FileTransfer) or len(requests) <= 2:
-            return True
-        query = requests[Packet.unpack(message.payload).sequence]
-        is_lost = query in lost
-        lost.discard(query)
-        return not is_lost
-
-    async with converse(Air.symmetric([Tap(vehicle, up=up, down=down)], delay=0.05)) as conversation:
-        moments = dict.fromkeys(cached, -80_000.0)
-        node = await with_cached_table(conversation, cached, moments=moments, volatile={"STAT_RUNTIME"})
-        vehicle.load({"STAT_BOOTCNT": 1 + int(cached["STAT_BOOTCNT"].value), "STAT_RUNTIME": 100})
-        result = await fetch_all(node.plain)
-        assert not lost
-        assert "PLDP_SPEED_DN" in result.changed
-        check(vehicle, node, result)
 
 
 @virtual
