@@ -155,21 +155,20 @@ class _Proof:
         seconds = {at for at, row in enumerate(rows) if row.bits and SECONDS.fullmatch(row.name)}
         often = {at for at, row in enumerate(rows) if row.name in table.volatile}
         rare = {at for at, row in enumerate(rows) if row.name == BOOT_COUNT or may_be_rounded(row)}
+        apart = {end for at in always | seconds | often | rare for end in (at, at + 1)}
         is_first = any(param.trust is Trust.CACHED for param in table.params.values())
         is_slow = is_first and (self._session.channel.timing.round_trip or 0.0) > SLOW_ROUND_TRIP
         alone = always | ({0} if is_slow else set())  # this one shows the count
         if is_first:
-            alone |= {at for at in seconds if now - table.moments[rows[at].name] >= 1}
+            alone |= {at for at in seconds if now - table.moments.get(rows[at].name, now) >= 1}
         first = {whole, *(range(at, at + 1) for at in alone)}
         await self._request(first)
         suspects: set[int] = set()
         while places := self._differing():
             if len(places) > 1:
                 places.pop(whole, None)  # its parts say more
-            moved: dict[int, int] = {}
-            for place, difference in places.items():
-                moved |= self._guess_moved(place, difference)
-            for at, bits in moved.items():
+            moved = [each for item in places.items() for each in self._guess_moved(*item)]
+            for at, bits in moved:
                 self._take(at, bits, anyio.current_time())
             if moved:
                 continue
@@ -179,7 +178,6 @@ class _Proof:
                 continue
             if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
                 suspects = {at for at, row in enumerate(rows) if MEASURED.fullmatch(row.name) and row.bits}
-            known = {place.start for place in self._found.keys() - places if len(place) == 1}
             is_other = not self._found.keys() - places - {whole}
             guesses: dict[int, int] = {}
             parts: set[range] = set()
@@ -190,8 +188,7 @@ class _Proof:
                 elif guess := self._guess(place, difference):
                     guesses |= guess
                 elif len(place) > 1:
-                    apart = always | ((seconds | often | rare) - known)
-                    ends = {end for at in apart for end in (at, at + 1)}.intersection(place[1:])
+                    ends = apart.intersection(place[1:])
                     if not ends:
                         divided.append(place)
                     ends |= self._divide(place)
@@ -248,17 +245,15 @@ class _Proof:
         if place.start == 0 and not crc32_px4_before(difference, 2) >> 16:
             raise TableDiffers(OTHER)
 
-    def _guess_moved(self, place: range, difference: int) -> dict[int, int]:
-        """Return the index and the bits of a value, alone in its range, that has just moved as it always
-        does: hardly anything else explains it, so that it needs no read."""
+    def _guess_moved(self, place: range, difference: int) -> Iterator[tuple[int, int]]:
+        """Yield the index and the bits of a value, alone in its range, that has just moved as it always does:
+        hardly anything else explains it, so that it needs no read."""
         moments, now = self._session.table.moments, anyio.current_time()
-        if len(place) > 1:
-            return {}
-        return {
-            at: bits
-            for at, bits in self._explanations(place, difference)
-            if _has_just_moved(self._rows[at], bits, now - moments.get(self._rows[at].name, now))
-        }
+        if len(place) == 1:
+            for at, bits in self._explanations(place, difference):
+                passed = now - moments.get(self._rows[at].name, now)
+                if _has_just_moved(self._rows[at], bits, passed):
+                    yield at, bits
 
     def _guess(self, place: range, difference: int) -> dict[int, int]:
         """Return the index and the bits of the simplest value that explains a difference alone, unless there
