@@ -205,7 +205,7 @@ async def test_a_file_that_is_not_valid_leads_to_the_list_and_drops_nothing(cont
             rows = [PackedParam(each.name, each.type, each.bits) for each in vehicle.listed]
             content = encode(rows)[:-7]
         vehicle.files.update(dict.fromkeys(("@PARAM/param.pck", "@PARAM/param.pck?withdefaults=1"), content))
-        second = await fetch_all(session)
+        second = await fetch_all(session, refresh=True)
         assert (first.source, second.source) == ("ftp", "stream")
         assert second.params.keys() == first.params.keys()
         assert not second.missing
