@@ -8,10 +8,10 @@ history do not see. Each function runs in a transaction.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from operator import attrgetter, itemgetter
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple
 
 from paramclient.cache.database import Transaction
 from paramclient.cache.records import (
@@ -70,20 +70,23 @@ def add_lines(tx: Transaction, owner: int, lines: Iterable[Line]) -> int:
     for (at,) in found:
         tx.do("DELETE FROM history WHERE owner = ? AND at <= ?", (owner, at))
         tx.do("UPDATE component SET known_since = ? WHERE id = ? AND known_since < ?", (at, owner, at))
+    return last_line(tx, owner)
+
+
+def last_line(tx: Transaction, owner: int) -> int:
+    """Return the number of the line of a table that was written last; 0 if there is none."""
     [(last,)] = tx.all("SELECT max(id) FROM history WHERE owner = ?", (owner,))
-    return int(last)
+    return last or 0
 
 
-Written: TypeAlias = tuple[int, float, StoredValue | None]
-"""The number of a line, its time and its new value."""
-
-
-def lines_since(tx: Transaction, owner: int, since: float) -> dict[str, list[Written]]:
-    """Return the lines since a time by parameter, in the order in which they were written."""
-    lines = defaultdict[str, list[Written]](list)
-    which = "SELECT id, at, name, new_type, new_value FROM history WHERE owner = ? AND at > ? ORDER BY id"
-    for number, at, name, *new in tx.all(which, (owner, since)):
-        lines[name].append((number, at, stored_value(new)))
+def lines_since(tx: Transaction, owner: int, since: float) -> dict[str, list[tuple[int, Line]]]:
+    """Return the lines since a time, with their numbers, by parameter and in the order in which they were
+    written."""
+    lines: dict[str, list[tuple[int, Line]]] = {}
+    which = f"SELECT id, {_LINE} FROM history WHERE owner = ? AND at > ? ORDER BY id"
+    for number, *row in tx.all(which, (owner, since)):
+        line = _line(row)
+        lines.setdefault(line.name, []).append((number, line))
     return lines
 
 
@@ -128,15 +131,11 @@ def values_at(
     tx: Transaction, owner: int, rows: Mapping[str, StoredParam], when: float
 ) -> dict[str, StoredValue]:
     """Return the values that a table had at a time since which its states are known."""
-    values = {name: row.stored for name, row in rows.items() if row.stored is not None}
+    values = {name: row.stored for name, row in rows.items()}
     later = f"SELECT name, {_OLD} FROM history WHERE owner = ? AND at > ? ORDER BY at DESC, id DESC"
     for name, *old in tx.all(later, (owner, when)):
-        value = stored_value(old)
-        if value is None:
-            values.pop(name, None)
-        else:
-            values[name] = value
-    return values
+        values[name] = stored_value(old)
+    return {name: value for name, value in values.items() if value is not None}
 
 
 class _Point(NamedTuple):
@@ -190,14 +189,12 @@ def merged_lines(
         points += [_Point(at, row.stored, BY_VEHICLE) for at in moments]
     points.sort(key=itemgetter(0))
     has_appeared = lines[0].old is None if lines else row is None and known_since is not None
-    first, *later = points
+    first = points[0]
     merged = [Line(first.at, name, first.by, None, None, first.value)] if has_appeared else []
-    last = first
-    for point in later:
+    for last, point in pairwise(points):
         if not is_same_value(last.value, point.value):
             old_at = None if last.value is None else last.at
             merged.append(Line(point.at, name, point.by, old_at, last.value, point.value))
-        last = point
     return merged
 
 

@@ -159,7 +159,10 @@ class ParamCache:
 
         def work(tx: Transaction) -> CachedComponent | None:
             table = tables.find_table(tx, key, component, extended=extended)
-            return None if table is None else tables.load_component(tx, table)
+            if table is None:
+                return None
+            self._known_lines.setdefault((table.owner, ""), history.last_line(tx, table.owner))
+            return tables.load_component(tx, table)
 
         return self._read(work)
 

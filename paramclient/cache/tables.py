@@ -214,8 +214,9 @@ def save_table(tx: Transaction, update: TableUpdate, now: float, known: dict[tup
         tx: the transaction.
         update: the update.
         now: the current time in unix seconds.
-        known: the last line that the program has written, or has received too, by table and name. Another
-            program may have written later ones of changes that this one, on a busy computer, receives late.
+        known: the last line that the program has written, or has received too, by table and name; with no
+            name, the last when it loaded the table. Another program may have written later ones of changes
+            that this one, on a busy computer, receives late.
     """
     horizon = max(now, update.at) + CLOCK_SLACK
     before = find_table(tx, update.identity.key, update.component, extended=update.extended)
@@ -230,18 +231,22 @@ def save_table(tx: Transaction, update: TableUpdate, now: float, known: dict[tup
     is_known = before is not None and before.known_since is not None
     agrees = is_whole = True
     is_rehashed = False
+    loaded = known.get((owner, ""), 0)
     lines: list[Line] = []
     first = min((item.heard_at for item in observed), default=update.at)
     recent = lines_since(tx, owner, first - SAME_CHANGE_MAX)
 
     def is_recorded(item: StoredParam) -> bool:
-        """Return whether another program has stored this change, and a later one."""
-        row, last = rows.get(item.name), known.get((owner, item.name), 0)
-        for number, at, value in recent.get(item.name, ()):
-            is_near = number > last and at > item.heard_at - SAME_CHANGE_MAX
-            if is_near and is_same_value(value, item.stored):
-                known[owner, item.name] = number
-                return not is_same_value(row and row.stored, item.stored)
+        """Return whether another program has stored this change, and a later one; or a change from the first
+        value that this one has received."""
+        row, last = rows.get(item.name), known.get((owner, item.name), loaded)
+        for number, line in recent.get(item.name, ()):
+            if number > last and line.at > item.heard_at - SAME_CHANGE_MAX:
+                is_first = (owner, item.name) not in known and is_same_value(line.old, item.stored)
+                if is_new := is_same_value(line.new, item.stored):
+                    known[owner, item.name] = number
+                if is_new or is_first:
+                    return not is_same_value(row and row.stored, item.stored)
         return False
 
     for batch in _rounds(observed):
@@ -260,6 +265,7 @@ def save_table(tx: Transaction, update: TableUpdate, now: float, known: dict[tup
                 lines.append(Line(item.heard_at, item.name, item.by, old_at, old_value, item.stored))
             rows[item.name] = item
             is_rehashed = is_rehashed or item.hashed != (old and old.hashed)
+    known.update({(owner, name): known.get((owner, name), loaded) for name in names})
     known |= dict.fromkeys(((owner, line.name) for line in lines), add_lines(tx, owner, lines))
     kept = TableState() if before is None else before.summary
     is_late = before is not None and update.at < before.summary.updated_at <= horizon
