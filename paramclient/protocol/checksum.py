@@ -155,7 +155,6 @@ class _Proof:
         seconds = {at for at, row in enumerate(rows) if row.bits and SECONDS.fullmatch(row.name)}
         often = {at for at, row in enumerate(rows) if row.name in table.volatile}
         rare = {at for at, row in enumerate(rows) if row.name == BOOT_COUNT or may_be_rounded(row)}
-        apart = {end for at in always | seconds | often | rare for end in (at, at + 1)}
         is_first = any(param.trust is Trust.CACHED for param in table.params.values())
         is_slow = is_first and (self._session.channel.timing.round_trip or 0.0) > SLOW_ROUND_TRIP
         alone = always | ({0} if is_slow else set())  # this one shows the count
@@ -188,7 +187,9 @@ class _Proof:
                 elif guess := self._guess(place, difference):
                     guesses |= guess
                 elif len(place) > 1:
-                    ends = apart.intersection(place[1:])
+                    fresh = alone if place == whole and not is_slow else set[int]()
+                    apart = (always | seconds | often | rare) - fresh
+                    ends = {end for at in apart for end in (at, at + 1)}.intersection(place[1:])
                     if not ends:
                         divided.append(place)
                     ends |= self._divide(place)
