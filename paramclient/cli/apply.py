@@ -291,11 +291,11 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
             options |= {"reboot": flags.reboot, "allow_armed": flags.allow_armed}
             jobs[session] = _Job(session, state, options)
 
-        await found.work(prepare)
-        for error in found.errors.values():
-            if isinstance(error, errors.FileError):  # before anything is sent to another vehicle
-                raise error
         with interruptible(found, jobs):
+            await found.work(prepare)
+            for error in found.errors.values():
+                if isinstance(error, errors.FileError):  # before anything is sent to another vehicle
+                    raise error
             if flags.dry_run or (not flags.yes and not flags.json and can_ask()):
                 plans = await found.work(lambda session: jobs[session].make_plan())
                 if flags.dry_run:

@@ -59,15 +59,16 @@ async def set_(
     """
     texts = _parse_pairs(pairs)
     async with sessions(url, options, writes=True) as found:
-        jobs = await found.work(bind(_prepare, texts=texts, choice=metadata, settle=settle, force=force))
-        doubts = dict.fromkeys(doubt for job in jobs.values() for doubt in job.doubts)
-        for doubt in doubts:
-            report(doubt)
-        if doubts and not force:
-            receivers = ", ".join(session.receiver for session in jobs)
-            question = f"Write these values to {receivers} all the same?"
-            await require_consent(question, "--force writes these values all the same")
+        jobs: dict[CommandSession, SetJob] = {}
         with interruptible(found, jobs):
+            jobs |= await found.work(bind(_prepare, texts=texts, choice=metadata, settle=settle, force=force))
+            doubts = dict.fromkeys(doubt for job in jobs.values() for doubt in job.doubts)
+            for doubt in doubts:
+                report(doubt)
+            if doubts and not force:
+                receivers = ", ".join(session.receiver for session in jobs)
+                question = f"Write these values to {receivers} all the same?"
+                await require_consent(question, "--force writes these values all the same")
             return found.show(await found.work(lambda session: jobs[session].write()))
 
 
@@ -155,7 +156,7 @@ def interruptible(found: Sessions, jobs: Mapping[CommandSession, WriteJob]) -> I
         yield
     except anyio.get_cancelled_exc_class():
         has_begun = any(job.has_begun for job in jobs.values())
-        if has_begun or found[0].options.json:
+        if has_begun or (jobs and found[0].options.json):
             found.show(jobs)
         say(f"interrupted: {'values without a proof may be in flight' if has_begun else 'nothing was sent'}")
         raise
