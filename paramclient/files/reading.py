@@ -37,6 +37,7 @@ _comment_start: Final = re.compile(r"(?<![0-9]\.)#|#(?!INF|IND|[QS]?NAN)|(?:(?<=
 """Start of a comment in a parameter list: no name or value can begin with `//` or `;`. The `#` of `1.#INF`
 and `-1.#IND`, which older C libraries of Windows print for infinity and NaN, does not start a comment."""
 _control: Final = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
+_control_before_comment: Final = re.compile(rf"^[^#\n]*?({_control.pattern})", re.MULTILINE)
 _undecoded: Final = re.compile(r"[\udc80-\udcff]")
 """A byte that is not UTF-8, as `decode_text` returns it."""
 _PLAIN_NAN: Final = struct.pack("<d", math.nan)
@@ -218,9 +219,9 @@ def decode_text(data: bytes, source: str) -> str:
     except UnicodeDecodeError as error:
         message = f"expected UTF-16 text, found the byte 0x{data[error.start]:02x}"
         raise FileError(message, source=source) from None
-    if control := _control.search(text):
-        line = text.count("\n", 0, control.start()) + 1
-        message = f"expected text, found the character 0x{ord(control[0]):02x}: unknown file format"
+    if control := _control_before_comment.search(text):
+        line = text.count("\n", 0, control.start(1)) + 1
+        message = f"expected text, found the character 0x{ord(control[1]):02x}: unknown file format"
         raise FileError(message, source=source, line=line)
     return text
 

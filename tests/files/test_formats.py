@@ -414,6 +414,10 @@ def test_a_comment_in_another_encoding_is_read() -> None:
     assert "quad.x:2: expected UTF-8 text, found the byte 0xf6" in str(failed("A,1\nHöhe,2".encode("cp1252")))
 
 
+def test_a_control_character_in_a_comment_is_no_fault() -> None:
+    assert [*loads(b"A,1\n# \x00\nB,2 # \x07\n", source="quad.param").choose()] == ["A", "B"]
+
+
 @pytest.mark.parametrize(
     "text",
     [
