@@ -237,16 +237,13 @@ def save_table(tx: Transaction, update: TableUpdate, now: float, known: dict[tup
     recent = lines_since(tx, owner, first - SAME_CHANGE_MAX)
 
     def is_recorded(item: StoredParam) -> bool:
-        """Return whether another program has stored this change, and a later one; or a change from the first
-        value that this one has received."""
+        """Return whether another program has stored this change, and a later one."""
         row, last = rows.get(item.name), known.get((owner, item.name), loaded)
         for number, line in recent.get(item.name, ()):
-            if number > last and line.at > item.heard_at - SAME_CHANGE_MAX:
-                is_first = (owner, item.name) not in known and is_same_value(line.old, item.stored)
-                if is_new := is_same_value(line.new, item.stored):
-                    known[owner, item.name] = number
-                if is_new or is_first:
-                    return not is_same_value(row and row.stored, item.stored)
+            is_near = number > last and line.at > item.heard_at - SAME_CHANGE_MAX
+            if is_near and is_same_value(line.new, item.stored):
+                known[owner, item.name] = number
+                return not is_same_value(row and row.stored, item.stored)
         return False
 
     for batch in _rounds(observed):
@@ -265,7 +262,6 @@ def save_table(tx: Transaction, update: TableUpdate, now: float, known: dict[tup
                 lines.append(Line(item.heard_at, item.name, item.by, old_at, old_value, item.stored))
             rows[item.name] = item
             is_rehashed = is_rehashed or item.hashed != (old and old.hashed)
-    known.update({(owner, name): known.get((owner, name), loaded) for name in names})
     known |= dict.fromkeys(((owner, line.name) for line in lines), add_lines(tx, owner, lines))
     kept = TableState() if before is None else before.summary
     is_late = before is not None and update.at < before.summary.updated_at <= horizon

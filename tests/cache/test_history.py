@@ -58,18 +58,6 @@ def test_a_program_that_reads_late_repeats_no_change(cache: ParamCache, open_cac
     assert values(cache) == {"PARAM_0": 0}
 
 
-def test_a_program_may_write_its_first_value_behind_a_change_of_it(
-    cache: ParamCache, open_cache: Open
-) -> None:
-    cache.save(whole_table(1))
-    cache.save(update(stored("PARAM_0", 1, at=NOW + 1.0), at=NOW + 1.0))
-    late = open_cache()
-    for value in (0, 1):
-        late.save(update(stored("PARAM_0", value, at=NOW + 1.5 + value / 10), at=NOW + 3.0))
-        assert values(cache) == {"PARAM_0": 1}
-    assert [line[2:4] for line in lines(cache)] == [(0, 1)]
-
-
 def test_programs_one_after_the_other_may_set_a_value_back(cache: ParamCache, open_cache: Open) -> None:
     table = whole_table(1)
     cache.save(table)
