@@ -218,7 +218,7 @@ class Session:
             return None
         message = self.typed(message)
         is_other = known is not None and not table.is_reported(known, raw, message.param_type)
-        is_answer = message.param_index != NO_INDEX
+        is_answer = message.param_index != NO_INDEX or (name in self.reading and not is_sent)
         until = table.moments.get(name, -math.inf) + LATE_TIME
         behind = (self._sequences.get(name, sequence) - sequence) % 256
         is_overtaken = may_read and 0 < behind < 128 and now <= until
