@@ -250,11 +250,12 @@ class UdpIn(SocketLink):
         return True
 
     def _learn(self, sender: Address, data: bytes) -> None:
-        """Remember the sender; forget the one silent for longest. A datagram of noise takes no time here."""
+        """Remember the sender; forget one of which no frame is known, else the one silent for longest. A
+        datagram of noise takes no time here."""
         _, unproven = self._peers.pop(sender, (0.0, data))
         self._peers[sender] = anyio.current_time(), unproven and data[:FIRST_BYTES]
         if len(self._peers) > PEERS_MAX:
-            del self._peers[next(iter(self._peers))]
+            del self._peers[min(self._peers, key=lambda each: not self._peers[each][1])]
 
     def _destinations(self, peer: Peer | None) -> Sequence[Address]:
         """Return the addresses to send to: of a peer, or for None of all."""

@@ -276,6 +276,20 @@ async def test_udpin_sends_to_every_known_vehicle() -> None:
                     sock.recv(1000)
 
 
+async def test_udpin_forgets_no_vehicle_for_senders_of_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sockets, "PEERS_MAX", 2)
+    async with opened("udpin:127.0.0.1:0") as link:
+        with udp_socket(link.address) as one, ExitStack() as others:
+            one.send(frame(1))
+            await collect(link, 1)
+            await link.send(frame(2), None)
+            for _ in range(3):
+                others.enter_context(udp_socket(link.address)).send(b"noise")
+            await collect(link, 3)
+            await link.send(frame(3), None)
+            assert [one.recv(1000), one.recv(1000)] == [frame(2), frame(3)]
+
+
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 async def test_a_port_in_use_is_a_link_error_until_it_is_free(kind: str) -> None:
     async with opened(f"{kind}:127.0.0.1:0") as first:
