@@ -72,9 +72,8 @@ def _write_packed(params: ParamSet) -> bytes:
     Raises:
         UsageError: the format cannot express a parameter: it has four types, and only numbers.
     """
-    with_defaults = all(param.default is not None for param in params.values())
-    entries = [_pack_entry(params, param) for param in params.values()]
-    return param_pck.encode(entries, with_defaults=with_defaults)
+    entries = [_pack_entry(params, each) for each in params.values()]
+    return param_pck.encode(entries, with_defaults=all(each.default is not None for each in params.values()))
 
 
 def _pack_entry(_: ParamSet, param: WrittenParam) -> param_pck.PackedParam:

@@ -26,7 +26,7 @@ from typing import Any, Final, NoReturn, TypeAlias
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import FileFormat, ParamFile
-from paramclient.files.reading import Reading, as_type, excerpt, is_plain, undecoded_byte
+from paramclient.files.reading import FAULTS_MAX, Reading, as_type, decoded, excerpt, is_plain
 from paramclient.model.identity import Identity
 from paramclient.model.notation import bits_written, time_text, value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -40,6 +40,7 @@ from paramclient.model.values import (
     check_ext_value,
     check_name,
     from_bits,
+    is_portable_name,
 )
 
 FAULT_LENGTH_MAX: Final = 300
@@ -58,6 +59,8 @@ _TYPES: Final = TYPES_BY_NAME | {_CUSTOM.name: _CUSTOM}
 _WORDS: Final = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _raw: Final = re.compile(r"0x([0-9a-fA-F]{8,256})").fullmatch
 _type_number: Final = re.compile(r"TYPE_([0-9]{1,3})").fullmatch
+_remark: Final = re.compile(r'"(?:comment|source|header)"\s*:[^"]*(?:"(?:[^"\\]|\\.)*"[\s,]*)+')
+"""Texts for readers only, with their keys."""
 _bits: Final = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
 
 # Documents
@@ -69,8 +72,6 @@ def read_json_text(text: str, source: str) -> Any:
     Raises:
         FileError: invalid JSON, or a repeated key.
     """
-    if (byte := undecoded_byte(text)) is not None:
-        raise FileError(byte[1], source=source, line=text.count("\n", 0, byte[0]) + 1)
     try:
         return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
     except json.JSONDecodeError as error:
@@ -86,7 +87,7 @@ def read_json_text(text: str, source: str) -> Any:
 def _fault(reading: Reading, place: Place, what: str, *, is_name: bool = False) -> None:
     """Add a fault at a position of the document."""
     line = None
-    if "params" in place[:-1] and not reading.is_full:
+    if "params" in place[:-1] and reading.fault_count < FAULTS_MAX:
         line = _line_of(reading.text, str(place[place.index("params") + 1]))
     described = f"{'.'.join(map(str, place)) or 'the document'}: {what}"
     if len(described) > FAULT_LENGTH_MAX:
@@ -159,7 +160,14 @@ def read_json(reading: Reading, file_format: FileFormat) -> ParamFile:
     Raises:
         FileError: invalid JSON, a repeated key, or not a valid document. The error names up to 20 faults.
     """
-    content = read_json_text(reading.text, reading.source)
+
+    def read_remark(found: re.Match[str]) -> str:
+        if (known := decoded(found[0])) != found[0]:
+            line = reading.text.count("\n", 0, found.start()) + 1
+            reading.foreign.append(f"line {line}")
+        return known
+
+    content = read_json_text(_remark.sub(read_remark, reading.text), reading.source)
     if not isinstance(content, dict) or _KEY not in content:
         raise FileError("not a parameter file of paramclient (JSON)", source=reading.source)
     found = _checked(reading, content, (), _DOCUMENT, {_KEY, "sets"})
@@ -181,6 +189,9 @@ def _set(reading: Reading, content: object, place: Place) -> ParamSet:
         except UsageError as error:
             _fault(reading, at, str(error), is_name=True)
             continue
+        if not is_portable_name(name):
+            at_line = "" if (line := _line_of(reading.text, name)) is None else f"line {line}: "
+            reading.notes.append(f"{at_line}the client ignores a parameter called {name!r} of a vehicle.")
         before = reading.fault_count
         known = _checked(reading, each, at, _PARAM, {"value"})
         if reading.fault_count == before:
@@ -222,12 +233,11 @@ def _whole(low: int, high: float, words: str) -> Callable[[Any], Any]:
     return _expected(lambda content: type(content) is int and low <= content <= high, words)
 
 
-_text: Final = _expected(lambda content: isinstance(content, str), "text")
+_text: Final = _expected(lambda content: isinstance(content, str) and decoded(content) == content, "text")
 _list: Final = _expected(lambda content: isinstance(content, list), "a list")
 _object: Final = _expected(lambda content: isinstance(content, dict), "an object")
 _count: Final = _whole(0, math.inf, "a whole number from 0")
 _id: Final = _whole(1, 255, "an id from 1 to 255")
-_component: Final = _whole(0, 255, "an id from 0 to 255")
 _version: Final = _whole(VERSION, VERSION, f"{VERSION}, the version of the format")
 
 
@@ -298,7 +308,7 @@ def _with_bits(value: Value, kind: ParamType | int | None, text: str) -> Value:
 _DOCUMENT: Final[Checks] = {_KEY: _version, "header": _texts, "sets": _list}
 _SET: Final[Checks] = {
     "system": _id,
-    "component": _component,
+    "component": _whole(0, 255, "an id from 0 to 255"),
     "extended": _expected(lambda content: isinstance(content, bool), "true or false"),
     "identity": _object,
     "at": _time,

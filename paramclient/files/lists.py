@@ -123,7 +123,7 @@ class _Pairs:
     def _number(self, line: TextLine, words: list[str], source: str) -> int | float | None:
         """Return the value of a line; None, with a fault, if it has none."""
         value = parse_number(words[1]) if len(words) > 1 else None
-        if line.text.startswith("@"):
+        if line.text.startswith("@") and value is None:
             problem = " (an unknown instruction for ArduPilot's tools)"
         elif _decimal_comma(line.text) and len(words) == 3:
             problem = " with a decimal point (1.5, not 1,5) and no third column"
@@ -194,7 +194,6 @@ def read_qgc(reading: Reading, file_format: FileFormat) -> ParamFile:
         if len(columns) != 5:
             reading.bad_line(line, _QGC_ROW)
             return
-        name = columns[2]
         try:
             system, component = _whole(columns[0], 1, 255, _QGC_IDS), _whole(columns[1], 0, 255, _QGC_IDS)
             kind = ParamType(_whole(columns[4], 1, 10, _QGC_TYPE))
@@ -202,8 +201,8 @@ def read_qgc(reading: Reading, file_format: FileFormat) -> ParamFile:
         except UsageError as error:
             reading.bad_line(line, str(error))
             return
-        if reading.has_name(line, name, "a parameter's name in the third column"):
-            param = WrittenParam(name, value, kind, comment=comment, line=line.number)
+        if reading.has_name(line, columns[2], "a parameter's name in the third column"):
+            param = WrittenParam(columns[2], value, kind, comment=comment, line=line.number)
             reading.add(param, f"line {line.number}", system, component)
 
     return reading.file(file_format, *_read_commented_lines(reading.text, reading, take))

@@ -83,11 +83,6 @@ class Reading:
             raise FileError("the file contains no parameters", source=self.source)
         return first
 
-    @property
-    def is_full(self) -> bool:
-        """Whether further faults are only counted."""
-        return self.fault_count >= FAULTS_MAX
-
     def fault(self, line: int | None, what: str, source: str = "", *, is_name: bool = False) -> None:
         """Add a fault.
 
@@ -102,7 +97,7 @@ class Reading:
             self.notes.append(f"{place + ': ' if place else ''}{what}; left out.")
             self._left_out += 1
             return
-        if not self.is_full:
+        if self.fault_count < FAULTS_MAX:
             self._faults.append((source or self.source, line, what))
         self.fault_count += 1
 
@@ -117,8 +112,9 @@ class Reading:
 
     def bad_line(self, line: TextLine, expected: str, source: str = "", *, is_name: bool = False) -> None:
         """Add a line that has other content than expected."""
-        byte = undecoded_byte(line.text)
-        what = f"expected {expected}, found {excerpt(line.text)}" if byte is None else byte[1]
+        what = f"expected {expected}, found {excerpt(line.text)}"
+        if byte := _undecoded.search(line.text):
+            what = f"expected UTF-8 text, found the byte 0x{ord(byte[0]) - 0xDC00:02x}"
         self.fault(line.number, what, source, is_name=is_name)
 
     def add(
@@ -163,13 +159,12 @@ class Reading:
             )
         if not any(sets):
             raise FileError("the file contains no parameters", source=self.source)
-        notes = self.notes
         if (more := self._repeated - FAULTS_MAX) > 0:
-            notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")
+            self.notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")
         if self.foreign:
             places = first_of(self.foreign, FAULTS_MAX)
-            notes.append(f"Comments that are not UTF-8 were read as Windows-1252: {places}.")
-        return ParamFile(sets, file_format, self.source, header, footer, tuple(notes), self._left_out)
+            self.notes.append(f"Comments that are not UTF-8 were read as Windows-1252: {places}.")
+        return ParamFile(sets, file_format, self.source, header, footer, tuple(self.notes), self._left_out)
 
 
 def _place(source: str, line: int | None) -> str:
@@ -226,13 +221,6 @@ def decode_text(data: bytes, source: str) -> str:
     return text
 
 
-def undecoded_byte(text: str) -> tuple[int, str] | None:
-    """Return the position of the first byte that is not UTF-8, and a sentence on it; None if all are."""
-    if found := _undecoded.search(text):
-        return found.start(), f"expected UTF-8 text, found the byte 0x{ord(found[0]) - 0xDC00:02x}"
-    return None
-
-
 def lines_of(text: str) -> Iterator[TextLine]:
     """Generate all lines, empty ones included, with their comments."""
     start = 0
@@ -244,7 +232,7 @@ def lines_of(text: str) -> Iterator[TextLine]:
             yield TextLine(number, line.strip(" \t"), None)
             continue
         comment = line[found.end() :].rstrip().removeprefix(" ")
-        known = _undecoded.sub(_from_windows, comment)
+        known = decoded(comment)
         yield TextLine(number, line[: found.start()].strip(" \t"), known, known != comment)
 
 
@@ -303,6 +291,11 @@ def is_plain(value: float) -> bool:
 def excerpt(text: str) -> str:
     """Return a piece of a file for an error: quoted, and shortened if it is long."""
     return repr(text if len(text) <= EXCERPT_LENGTH_MAX else f"{text[:EXCERPT_LENGTH_MAX]}…")
+
+
+def decoded(text: str) -> str:
+    """Return text in which bytes that are not UTF-8 are read as Windows-1252."""
+    return _undecoded.sub(_from_windows, text)
 
 
 def _from_windows(byte: re.Match[str]) -> str:

@@ -105,6 +105,7 @@ def test_what_a_format_cannot_hold_is_left_out_and_named(
         write_file(spaced, ParamSet({"A": 1, "A B": 2}, 1, 1))
         saved = command("save", spaced, path)
         assert (saved.code, "can hold them: A B" in saved.err) == (0, True)
+        assert "line 9: the client ignores a parameter called 'A B'" in saved.err
 
 
 def test_a_vehicle_with_component_0_is_written_and_read(command: Command, put: Put, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ TYPED = [FileFormat.QGC, FileFormat.JSON]
 PAIRS = [FileFormat.PARM, FileFormat.MISSION_PLANNER]
 
 float_bits = st.integers(0, 0xFFFFFFFF).filter(lambda bits: bits & 0x7F800000 != 0x7F800000)
-BAD_NAMES = ["SIM_GPS1_BYTELOSS", "MC R", " "]
+BAD_NAMES = ["SIM_GPS1_BYTELOSS", "MC R", " ", "@FOO"]
 NOT_FINITE = [bits_of(value, ParamType.REAL32) for value in (math.nan, math.inf, -math.inf)]
 
 
@@ -294,10 +294,7 @@ def test_the_last_value_of_a_repeated_name_is_used(text: str, value: float, note
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        (
-            "A,1,5",
-            "expected NAME,VALUE with a decimal point (1.5, not 1,5) and no third column, found 'A,1,5'",
-        ),
+        ("A,1,5", "expected NAME,VALUE with a decimal point (1.5, not 1,5) and no third column, found"),
         ("A 1,5", "with a decimal point"),
         ("A 1.5 m/s", "and nothing after it (no unit, no further column)"),
         ("A", "expected NAME VALUE, found 'A'"),
@@ -412,6 +409,10 @@ def test_a_comment_in_another_encoding_is_read() -> None:
     assert (file.header, file.sets[0]["B"].comment) == (("Höhe",), "für Jo")
     assert file.notes == ("Comments that are not UTF-8 were read as Windows-1252: line 1, line 3.",)
     assert "quad.x:2: expected UTF-8 text, found the byte 0xf6" in str(failed("A,1\nHöhe,2".encode("cp1252")))
+    text = '{"paramclient": 1, "header": ["", "Höhe"],\n"sets": [{"params": {"A": {"value": 1},\n"ö": {}}}]}'
+    file = loads(text.encode("cp1252"), partial=True)
+    assert (file.header, [*file.sets[0]], file.notes[0][:8]) == (("", "Höhe"), ["A"], "line 3: ")
+    assert "Windows-1252: line 1." in file.notes[1]
 
 
 def test_a_control_character_in_a_comment_is_no_fault() -> None:
