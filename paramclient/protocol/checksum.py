@@ -140,6 +140,18 @@ class _Proof:
         self._round_trip = math.inf  # of the quickest requests
         self._is_scattered = False  # the latest checksums
         self._byte_time = 0.0  # seconds for each byte of requests that waited for each other
+        table, now = session.table, anyio.current_time()
+        measures = session.identification.vehicle_type in PLANES_AND_ROVERS
+        self._always = self._named(PRESSURE) if measures else set[int]()  # rows that always move
+        seconds = self._named(SECONDS)
+        often = {at for at, row in enumerate(rows) if row.name in table.volatile}
+        rare = {at for at, row in enumerate(rows) if row.name == BOOT_COUNT or may_be_rounded(row)}
+        self._moving = self._always | seconds | often | rare  # rows that may have moved
+        is_first = any(param.trust is Trust.CACHED for param in table.params.values())
+        is_slow = is_first and (session.channel.timing.round_trip or 0.0) > SLOW_ROUND_TRIP
+        passed = {at for at in seconds if is_first and now - table.moments.get(rows[at].name, now) >= 1}
+        self._alone = self._always | passed | ({0} if is_slow else set())  # compared first; 0 shows the count
+        self._fresh = set[int]() if is_slow else self._alone
 
     async def run(self) -> None:
         """Compare, and read what differs, until nothing does.
@@ -147,20 +159,8 @@ class _Proof:
         Raises:
             TableDiffers: the tables are too different.
         """
-        rows, table, now = self._rows, self._session.table, anyio.current_time()
-        whole, repeats = range(len(rows)), 0
-        always: set[int] = set()
-        if self._session.identification.vehicle_type in PLANES_AND_ROVERS:
-            always = {at for at, row in enumerate(rows) if row.bits and PRESSURE.fullmatch(row.name)}
-        seconds = {at for at, row in enumerate(rows) if row.bits and SECONDS.fullmatch(row.name)}
-        often = {at for at, row in enumerate(rows) if row.name in table.volatile}
-        rare = {at for at, row in enumerate(rows) if row.name == BOOT_COUNT or may_be_rounded(row)}
-        is_first = any(param.trust is Trust.CACHED for param in table.params.values())
-        is_slow = is_first and (self._session.channel.timing.round_trip or 0.0) > SLOW_ROUND_TRIP
-        alone = always | ({0} if is_slow else set())  # this one shows the count
-        if is_first:
-            alone |= {at for at in seconds if now - table.moments.get(rows[at].name, now) >= 1}
-        first = {whole, *(range(at, at + 1) for at in alone)}
+        rows, whole, repeats = self._rows, range(len(self._rows)), 0
+        first = {whole, *(range(at, at + 1) for at in self._alone)}
         await self._request(first)
         suspects: set[int] = set()
         while places := self._differing():
@@ -171,12 +171,12 @@ class _Proof:
                 self._take(at, bits, anyio.current_time())
             if moved:
                 continue
-            if always and self._is_scattered and not repeats and whole in places:
+            if self._always and self._is_scattered and not repeats and whole in places:
                 repeats += 1
                 await self._request(first)
                 continue
             if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
-                suspects = {at for at, row in enumerate(rows) if MEASURED.fullmatch(row.name) and row.bits}
+                suspects = self._named(MEASURED)
             is_other = not self._found.keys() - places - {whole}
             guesses: dict[int, int] = {}
             parts: set[range] = set()
@@ -187,14 +187,10 @@ class _Proof:
                 elif guess := self._guess(place, difference):
                     guesses |= guess
                 elif len(place) > 1:
-                    fresh = alone if place == whole and not is_slow else set[int]()
-                    apart = (always | seconds | often | rare) - fresh
-                    ends = {end for at in apart for end in (at, at + 1)}.intersection(place[1:])
+                    ends = self._ends_of_moving(place)
                     if not ends:
                         divided.append(place)
-                    ends |= self._divide(place)
-                    parts |= {range(*each) for each in pairwise((place.start, *sorted(ends), place.stop))}
-                    del self._found[place]
+                    parts |= self._divide(place, ends)
                 elif is_other or repeats == REPEATS_MAX:
                     raise TableDiffers(OTHER)
                 else:
@@ -207,13 +203,25 @@ class _Proof:
                 await self._read(guesses)
                 suspects -= guesses.keys()
 
+    def _named(self, names: re.Pattern[str]) -> set[int]:
+        """Return the rows with such names, but for those with a value of 0."""
+        return {at for at, row in enumerate(self._rows) if row.bits and names.fullmatch(row.name)}
+
     @property
     def _parts(self) -> int:
         return min(max(PARTS_MIN, int(self._round_trip / PART_TIME)), PARTS_MAX)
 
-    def _divide(self, place: range) -> set[int]:
+    def _ends_of_moving(self, place: range) -> set[int]:
+        """Return where the rows that move begin and end in a range, but for those that were just compared."""
+        moving = self._moving - (self._fresh if len(place) == len(self._rows) else set())
+        return {end for at in moving for end in (at, at + 1)}.intersection(place[1:])
+
+    def _divide(self, place: range, ends: set[int]) -> set[range]:
+        """Divide a range at these rows, and into parts of equal size."""
+        del self._found[place]
         size = -(-len(place) // self._parts)
-        return set(range(place.start + size, place.stop, size))
+        ends = ends.union(range(place.start + size, place.stop, size))
+        return {range(*each) for each in pairwise((place.start, *sorted(ends), place.stop))}
 
     def _entries(self, place: range) -> list[bytes]:
         if place not in self._encoded:

@@ -236,9 +236,8 @@ class Identification:
             return False
 
         def request_of(attempt: int) -> messages.CommandLong:
-            if ways[0].command in refused or (attempt >= 2 and attempt % 2):
-                return ways[1]
-            return ways[0]
+            is_second = ways[0].command in refused or (attempt >= 2 and attempt % 2 == 1)
+            return ways[is_second]
 
         with channel.inbox(*keys) as inbox, suppress(NoReply):
             attempts = VERSION_ATTEMPTS_MAX

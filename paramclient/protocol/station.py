@@ -139,10 +139,8 @@ class Station:
         if frame.component == messages.AUTOPILOT_COMPONENT and now >= self._seek_at and requests < SEEK_MAX:
             self._seek_at = now + SEEK_INTERVAL
             self._sought[frame.system] += 1
-            target = (frame.system, frame.component)
-            request = messages.CommandLong(
-                *target, messages.MAV_CMD_REQUEST_MESSAGE, float(message_id(Heartbeat))
-            )
+            target, wanted = (frame.system, frame.component), float(message_id(Heartbeat))
+            request = messages.CommandLong(*target, messages.MAV_CMD_REQUEST_MESSAGE, wanted)
             self.transmit(request, peer, frame.version)
 
     def probe(self, system: int, component: int) -> None:
