@@ -9,20 +9,11 @@ from functools import partial
 
 import anyio
 
+from paramclient.cli import output
 from paramclient.cli.json_output import JsonObject, fetch_json, info_of, param_json, param_value, taken
 from paramclient.cli.metadata import MetadataChoice, default_in, defaults_in, known_of_session, say_sources
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import (
-    ExitCode,
-    cells_of,
-    local_time,
-    milliseconds,
-    print_json,
-    print_line,
-    report,
-    report_all,
-    say,
-)
+from paramclient.cli.output import ExitCode, cells_of, report, report_all, say
 from paramclient.cli.session import CommandSession, Sessions, check_given, get_chosen, noun_of, sessions
 from paramclient.client.client import Event
 from paramclient.errors import ParamClientError, VehicleError
@@ -146,7 +137,7 @@ def _report_fetch(session: CommandSession, result: FetchResult, errors: Collecti
         of = f" of {result.count}" if result.missing else ""
         crc = "" if result.hash is None else f"; hash {hash_text(result.hash)}"
         lost = "" if result.source == "cache" else f"{result.lost} lost, {result.repeated} repeated, "
-        trip = "" if result.round_trip is None else f"round trip {milliseconds(result.round_trip)}, "
+        trip = "" if result.round_trip is None else f"round trip {output.milliseconds(result.round_trip)}, "
         link = " on the whole link" if len(client.components) > 1 else ""
         fetched = f"{result.received}{of} {noun_of(session.component)}s of {label} from {result.source}"
         traffic = f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent{link}"
@@ -193,6 +184,7 @@ async def _watch(session: CommandSession, given: Sequence[str], found: Sessions)
             return report_all(errors.values(), session.prefix)
         is_first = set(component.params)
     noun, size = noun_of(component), len(component.params)
+    lead = f"{session.label}: " if session.shown_address else ""
     everything = f"all {noun}s" if is_first is None else counted(size, noun)
     say(f"watching {', '.join(given) or everything} of {session.label}")
     if session is found[0]:
@@ -212,7 +204,7 @@ async def _watch(session: CommandSession, given: Sequence[str], found: Sessions)
                     is_first = is_first and is_first - {change.name}
                 elif choice.has(change.name):
                     item, text = _change(change)
-                    _print(session, item, f"{session.prefix}{text}")
+                    _print(session, item, f"{lead}{text}")
     return ExitCode.DONE
 
 
@@ -221,9 +213,9 @@ def _print(session: CommandSession, item: JsonObject, text: str) -> None:
     link = session.client.link
     now = (link.at if isinstance(link, ReplayLink) else None) or time.time()
     if session.options.json:
-        print_json({"time": time_text(now)} | session.ids | item)
+        output.print_json({"time": time_text(now)} | session.ids | item)
     else:
-        print_line(f"{local_time(now)}  {text}")
+        output.print_line(f"{output.local_time(now)}  {text}")
 
 
 def _change(change: Change) -> tuple[JsonObject, str]:

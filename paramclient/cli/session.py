@@ -17,7 +17,7 @@ from paramclient.cli.output import ExitCode, Status, listed, print_json, print_t
 from paramclient.client.client import VEHICLES_LISTENING_TIME, ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import AmbiguousVehicle, NoReply, ParamClientError, UnknownParameter, UsageError
-from paramclient.links import LinkKind
+from paramclient.links import LinkKind, SimLink
 from paramclient.model.identity import version_text
 from paramclient.model.names import NameChoice, counted, did_you_mean, is_pattern, nearest_names
 from paramclient.model.paramset import ParamSet
@@ -115,13 +115,17 @@ def noun_of(params: Component | ParamSet) -> str:
 
 @dataclass(frozen=True, slots=True)
 class CommandSession:
-    """An open client, and a component that the command works on: with --extended, its extended parameters."""
+    """An open client, and a component that the command works on: with --extended, its extended parameters.
+
+    If the command writes, the component is the only one, or chosen by --vehicle.
+    """
 
     client: ParamClient
     component: Component
     deadline: Deadline
     options: LinkOptions
     choice: ChosenVehicle
+    writes: bool
 
     @property
     def address(self) -> str:
@@ -148,10 +152,15 @@ class CommandSession:
 
     @property
     def prefix(self) -> str:
-        """The beginning of a line about the component: its label if it may be one of several, else ""."""
-        writer, is_named = self.client.core.cache_writer, self.options.vehicle is not None
-        others = self.others or (not is_named and writer.knows_another(self.component.node))
-        return f"{self.label}: " if self.choice.is_all or others else ""
+        """The beginning of a remark on the component: its label if others were heard, else ""."""
+        return f"{self.label}: " if self.choice.is_all or self.others else ""
+
+    @property
+    def shown_address(self) -> str | None:
+        """The address in results, unless the component is certainly the one that was meant."""
+        link, is_named = self.client.link, self.writes or self.options.vehicle is not None
+        is_only = is_named or (isinstance(link, SimLink) and link.has_one_vehicle)
+        return self.address if self.choice.is_all or not is_only else None
 
     @property
     def receiver(self) -> str:
@@ -260,14 +269,12 @@ class Sessions(list[CommandSession]):
     def show(self, results: Mapping[CommandSession, Shown]) -> int:
         """Print results as one table or as JSON, then remarks and failures; return the exit code.
 
-        If none was named, and several are heard or the cache has others of the link, the table says which
-        vehicle it shows.
+        If none was named, the table says which vehicle it shows.
         """
         self.report_others()
         found = results.items()
         if not self[0].options.json:
-            named = [(session.address if session.prefix else None, result) for session, result in found]
-            rows = [(address, *cells) for address, result in named for cells in result.rows()]
+            rows = [(session.shown_address, *cells) for session, each in found for cells in each.rows()]
             if rows:
                 print_table(["vehicle", *next(iter(results.values())).columns], rows)
         else:
@@ -335,7 +342,7 @@ async def sessions(
         for each in found:
             if not each.is_extended and expects_extended(each.identity.vehicle_type, each.component):
                 say(f"{each.system}/{each.component} usually has extended parameters: --extended uses them")
-        yield Sessions(CommandSession(client, each, deadline, options, choice) for each in found)
+        yield Sessions(CommandSession(client, each, deadline, options, choice, writes) for each in found)
 
 
 def open_client(url: str, options: TrafficOptions, **more: Any) -> ParamClient:

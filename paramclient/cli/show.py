@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from paramclient.cache import CachedComponent, ParamCache
+from paramclient.cli import output
 from paramclient.cli.cached import show_summaries
 from paramclient.cli.json_output import info_json, info_of, param_value, set_json, table_param_json, taken
 from paramclient.cli.metadata import METADATA_HINT, MetadataFile, default_in, known_of_sets, say_sources
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.output import ExitCode, cells_of, local_time, print_json, print_line, print_table, say
+from paramclient.cli.output import ExitCode, cells_of, local_time, print_line, report, say
 from paramclient.cli.session import check_given
 from paramclient.cli.sources import check_link, described, part_of
 from paramclient.errors import UsageError, VehicleError
@@ -72,13 +73,13 @@ async def show(
         raise VehicleError(NO_DEFAULTS, sets[0].system or 0, sets[0].component or 0)
     items = [set_json(shown, known, whole=bool(chosen)) for shown, known, _ in views]
     if options.json:
-        print_json({"components": items})
+        output.print_json({"components": items})
         return ExitCode.DONE
     for (shown, known, defaults), item in zip(views, items, strict=True):
         columns = ("name", "value", "default", "type", "meaning", "units", "comment")
         vehicle = address(shown) if len(items) > 1 else None
         rows = ([vehicle, *cells] for cells in cells_of(item["params"], *columns[1:]))
-        print_table(["vehicle", *columns], rows)
+        output.print_table(["vehicle", *columns], rows)
         for name in shown if chosen and known is not None else ():
             _print_description(name, info_of(known, name))
         say(described(shown) + (", those that differ from their default" if changed else ""))
@@ -121,12 +122,9 @@ def search(
         value = f"{len(values)} values" if len(values) > 1 else next(iter(values), None)
         where = ", ".join(f"{each.system}/{each.component}" for each in tables)
         rows.append((name, value, where, description))
-    if options.json:
-        print_json({"results": found})
-    else:
-        print_table(["name", "value", "vehicle", "description"], rows)
+    output.show({"results": found}, ["name", "value", "vehicle", "description"], rows, json=options.json)
     if not found:
-        say(f"nothing found; {counted(len(known.names), 'parameter')} searched")
+        report(f"nothing found; {counted(len(known.names), 'parameter')} searched")
     if known.undescribed and not options.json:
         say(f"only names of {known.undescribed} were searched: {METADATA_HINT}")
     return ExitCode.DONE if found else ExitCode.INCOMPLETE
@@ -160,14 +158,14 @@ def info(
         cells = map(param.get, ("value", "text", "type", "default", "default_source"))
         rows.append((f"{table.system}/{table.component}", *cells, local_time(heard), table.key))
     if options.json:
-        print_json({"name": spelled, "metadata": info and info_json(info), "vehicles": vehicles})
+        output.print_json({"name": spelled, "metadata": info and info_json(info), "vehicles": vehicles})
         return ExitCode.DONE
     _print_description(spelled, info)
     if info is None and known.undescribed:
         say(f"no metadata of {known.undescribed} is known: {METADATA_HINT}")
     if rows:
         print_line("")
-        print_table(("vehicle", "value", "meaning", "type", "default", "source", "heard", "key"), rows)
+        output.print_table(("vehicle", "value", "meaning", "type", "default", "source", "heard", "key"), rows)
     return ExitCode.DONE
 
 

@@ -95,7 +95,6 @@ class CacheWriter:
         self._is_synced = True  # what was written is safe from power loss
         self._something_to_write = anyio.Event()
         self._known: set[tuple[int | str, int]] = set()  # systems and keys of vehicles, with components
-        self._systems: set[tuple[str, int]] = set()  # the links and the system ids of vehicles
         self._ahead = -math.inf  # of unix time to the time of the event loop, in seconds
         self._replacements = 0 if cache is None else cache.replacements
 
@@ -105,7 +104,6 @@ class CacheWriter:
             with suppress(CacheError):
                 found = await self._call(self.cache.components)
                 self._known = {(which, each.component) for each in found for which in (each.system, each.key)}
-                self._systems = {(each.identity.link, each.system) for each in found}
 
     async def close(self, nodes: Collection[Node]) -> None:
         """Write all new values, warn of lost ones, and close the cache if it is owned.
@@ -144,11 +142,6 @@ class CacheWriter:
     def may_have(self, node: Node) -> bool:
         """Return whether the cache had a table for these ids when the client was opened."""
         return (node.system, node.component) in self._known
-
-    def knows_another(self, node: Node) -> bool:
-        """Return whether the cache had another system id on the link when the client was opened."""
-        link = node.identification.identity.link
-        return any(each[0] == link and each[1] != node.system for each in self._systems)
 
     def may_load(self, node: Node, vehicle: Node) -> bool:
         """Return whether it is known which vehicle a component belongs to, as far as the cache knows: the

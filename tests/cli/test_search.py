@@ -42,7 +42,7 @@ def test_search_finds_names_descriptions_and_value_names(command: Command) -> No
 def test_search_reports_that_nothing_was_found(command: Command) -> None:
     nothing = command("search", "xyzzy")
     assert (nothing.code, nothing.out) == (1, "")
-    assert nothing.err.startswith("nothing found; ")
+    assert nothing.err.startswith("paramclient: nothing found; ")
     assert "only names of 2/1 ardupilot were searched: `paramclient fetch LINK --metadata " in nothing.err
     of_described = command("search", "xyzzy", "--vehicle", 1)
     assert of_described.err == "nothing found; 903 parameters searched\n"
