@@ -45,7 +45,7 @@ def test_search_reports_that_nothing_was_found(command: Command) -> None:
     assert nothing.err.startswith("paramclient: nothing found; ")
     assert "only names of 2/1 ardupilot were searched: `paramclient fetch LINK --metadata " in nothing.err
     of_described = command("search", "xyzzy", "--vehicle", 1)
-    assert of_described.err == "nothing found; 903 parameters searched\n"
+    assert of_described.err == "paramclient: nothing found; 903 parameters searched\n"
 
 
 def test_search_prints_a_value_that_all_vehicles_have_and_the_number_of_different_ones(
