@@ -22,7 +22,7 @@ from paramclient.cli.options import ApplyFlags
 from paramclient.cli.output import ExitCode, Status, can_ask, code_of, confirm, listed, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, check_given, get_chosen, sessions
 from paramclient.cli.set_command import interruptible
-from paramclient.cli.sources import described, filled, is_pattern_name, resolve_all
+from paramclient.cli.sources import described, filled, is_pattern_name, not_a_file, resolve_all
 from paramclient.files import FileFormat, ParamFile
 from paramclient.model.names import age_in_words, is_pattern
 from paramclient.model.paramset import ParamSet
@@ -31,7 +31,7 @@ from paramclient.provision.apply_rules import CATEGORIES, READ_ONLY
 from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
 from paramclient.provision.execution import run as run_apply
 from paramclient.provision.inspection import plan, wait_for_identity
-from paramclient.provision.planning import ApplyRow, ApplyStatus, Plan, Rows
+from paramclient.provision.planning import MISSING, ApplyRow, ApplyStatus, Plan, Rows
 from paramclient.provision.sources import NO_DEFAULTS, choose, is_file, read_source
 
 _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be revealed"}
@@ -48,14 +48,14 @@ class State:
         params: the values.
         is_restore: whether they are an earlier state of the vehicle.
         partial: whether invalid values and unknown names are skipped.
-        is_part: whether values are missing, so that the command cannot end as complete.
+        code: the exit code if all values are written: not 0 if some are missing.
         to_continue: how to continue after an interruption.
     """
 
     params: ParamSet
     is_restore: bool = False
     partial: bool = True
-    is_part: bool = False
+    code: ExitCode = ExitCode.DONE
     to_continue: str = "run it again to continue"
 
 
@@ -77,8 +77,8 @@ async def apply(
     All or nothing: with an invalid value, or a name that the vehicle does not have, nothing is written (exit
     code 2), unless --partial is given. The previous state is stored in the cache, for `restore`. On a
     terminal, the changes are shown and must be confirmed. Exit code 0: the vehicle has all values of the
-    file. Exit code 1: some values differ. After an interruption, run the same command again to continue. If
-    several vehicles are heard, --vehicle must choose one, or all.
+    file. Exit code 1: some values differ; 2: the vehicle lacks a name. After an interruption, run the same
+    command again to continue. If several vehicles are heard, --vehicle must choose one, or all.
 
     Left out are actions, and by default the categories identity, hardware, calibration, measured, counter,
     read-only and out-of-range.
@@ -116,8 +116,8 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
         try:
             moment = None if when is None else parse_moment(when, time.time())
         except errors.UsageError as error:
-            problem = f"no such file, nor the number of a snapshot (history VEHICLE --snapshots): {error}"
-            raise errors.UsageError(problem) from None
+            snapshot = "the number of a snapshot (history VEHICLE --snapshots)"
+            raise errors.UsageError(f"{not_a_file(str(when))}, nor {snapshot}: {error}") from None
         return await _run(url, options, bind(_earlier_state, moment))
     if ChosenVehicle.parse(options.vehicle).is_all and not is_pattern_name(when):
         raise errors.UsageError("with --vehicle all, the backup file needs {uid} or {system} in its name")
@@ -190,7 +190,7 @@ async def _from_file(
         has_uid = origin is not None and origin.uid is not None
         if own.uid and not has_uid and (session.choice.uid or own.uid in params.source):
             params = replace(params, identity=replace(origin or own, uid=own.uid))
-        return State(params, is_restore, partial, is_part=file.left_out > 0)
+        return State(params, is_restore, partial, ExitCode.USAGE if file.left_out else ExitCode.DONE)
 
     is_extended = options.extended or (source is not None and source.is_extended)
     return load, replace(options, extended=is_extended)
@@ -248,7 +248,8 @@ async def _defaults(chosen: Sequence[str], choice: MetadataChoice, session: Comm
     is_cut = any(map(is_pattern, chosen)) and session.report_missing(missing) > 0
     if without:
         report(f"{session.prefix}not written, as their default is not known: {listed(without)}")
-    return State(ParamSet(wanted, source="the firmware's defaults"), is_part=is_cut or bool(without))
+    code = ExitCode.INCOMPLETE if is_cut or without else ExitCode.DONE
+    return State(ParamSet(wanted, source="the firmware's defaults"), code=code)
 
 
 # Plans and writes
@@ -398,13 +399,13 @@ class _Job:
         words = ", ".join(f"{count} {_WORDS.get(status, status)}" for status, count in found.counts.items())
         remarks = list[str]()
         done = [row for row in found.rows.values() if row.status not in _WORDS]
-        is_part = self.state.is_part or not all(row.is_as_wanted for row in done)
-        code = ExitCode.INCOMPLETE if is_part else ExitCode.DONE
+        is_whole = all(row.is_as_wanted for row in done)
+        code = max(self.state.code, ExitCode.DONE if is_whole else ExitCode.INCOMPLETE)
         if isinstance(found, Plan):
             made, end, late = found, "; nothing was sent", found.reboot_for + found.awaiting_reboot
             if session.component.is_armed and not options["allow_armed"]:
                 remarks.append("armed; nothing would be set now without --allow-armed")
-                code = ExitCode.INCOMPLETE
+                code = max(code, ExitCode.INCOMPLETE)
             if found.problems and not options["partial"]:
                 remarks.append(f"nothing would be sent without --partial: {listed([*found.problems])}")
                 code = ExitCode.USAGE
@@ -417,6 +418,8 @@ class _Job:
         else:
             say(f"{session.receiver}: {words or 'nothing acknowledged'}; {self.state.to_continue}")
             return code
+        if any(found.rows[name].category == MISSING for name in made.problems):
+            code = max(code, ExitCode.USAGE)
         if not session.options.json:
             say(f"{session.receiver}: {words or 'nothing to set'}{end}")
             if left_out := Counter(row.category for row in found.shown_rows if row.category in _INCLUDABLE):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from functools import partial as bind
@@ -118,7 +119,12 @@ def check_link(text: str) -> None:
             parse_link(text)
     except UsageError as error:
         links = f"; {error}" if ":" in text else ""
-        raise UsageError(f"no such file: {text}, nor a vehicle in the cache (cache:VEHICLE){links}") from None
+        raise UsageError(f"{not_a_file(text)}, nor a vehicle in the cache (cache:VEHICLE){links}") from None
+
+
+def not_a_file(text: str) -> str:
+    """Return why a text names no file, as the beginning of a sentence."""
+    return f"{text} is a folder" if os.path.isdir(text) else f"no such file: {text}"  # noqa: PTH112 - any text
 
 
 def part_of(params: ParamSet, names: Container[str]) -> ParamSet:

@@ -98,8 +98,8 @@ class Identity:
 def check_ids(system: int | None, component: int | None, least: int = 0) -> None:
     """Raise UsageError for ids that no component has; `least` is the smallest component id."""
     for number, low in ((system, 1), (component, least)):
-        if number is not None and not low <= number <= 255:
-            raise UsageError(f"system ids are 1 to 255, component ids {least} to 255, not {number}")
+        if number is not None and number not in range(low, 256):
+            raise UsageError(f"system ids are 1 to 255, component ids {least} to 255, not {number!r}")
 
 
 def is_sitl_uid(uid: str | None) -> bool:
