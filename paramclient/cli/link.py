@@ -58,24 +58,24 @@ async def link(
     """
     is_live = sys.stdout.isatty() and not options.json
     deadline = Deadline(seconds, None if is_live else LINK_LISTENING_TIME)
-    opened = open_client(url, options, cache=False, traffic=True, listen_only=listen_only)
+    opened, found = open_client(url, options, cache=False, traffic=True, listen_only=listen_only), None
     async with opened as client, task_group() as tasks:
         tasks.start_soon(_measure_round_trips, client)
-        while left := deadline.left(REFRESH_INTERVAL):
-            await anyio.sleep(left)
-            report = client.traffic_report(is_recent=is_live)  # raises if the link has failed
-            found = _json(client, report)
-            if is_live:
-                sys.stdout.write("\x1b[H\x1b[J")  # erases it, for the next table in the same place
-                _print(found)
+        try:
+            while left := deadline.left(REFRESH_INTERVAL):
+                await anyio.sleep(left)
+                report = client.traffic_report(is_recent=is_live)  # raises if the link has failed
+                found = _json(client, report)
+                if is_live:
+                    sys.stdout.write("\x1b[H\x1b[J")  # erases it, for the next table in the same place
+                    _print(found)
+        finally:  # also after Ctrl-C
+            if found and found["frames"] and not is_live:
+                (print_json if options.json else _print)(found)
         tasks.cancel_scope.cancel()
-        if not found["frames"]:
+        if not (found and found["frames"]):
             what, hint = f"a MAVLink frame on {client.link.name}", received_in_words(client)
             raise NoReply(what, attempts=0, waited=report.seconds, hint=hint)
-    if options.json:
-        print_json(found)
-    elif not is_live:
-        _print(found)
 
 
 async def _measure_round_trips(client: ParamClient) -> None:

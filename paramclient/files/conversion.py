@@ -268,7 +268,7 @@ def _header_lines(params: ParamSet) -> Iterator[str]:
     """Generate a description of a set, for the header of a file."""
     identity = params.identity
     kind = "" if identity is None else f", {autopilot_name(identity.autopilot)}"
-    yield f"{counted(len(params), 'parameter')} of system/component {address(params)}{kind}"
+    yield f"{counted(len(params), 'parameter')} of {address(params)}{kind}"
     if identity is not None:
         commit = f", commit {identity.git_hash}" if identity.git_hash else ""
         firmware = f", firmware {version_text(identity.firmware)}{commit}" if identity.firmware else ""

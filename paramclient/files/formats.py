@@ -112,4 +112,6 @@ class ParamFile:
 
 def address(params: ParamSet) -> str:
     """Return the system and component id of a set, `1/100`, with a question mark for an unknown id."""
+    if params.system is None and params.component is None:
+        return "an unknown vehicle"
     return "/".join("?" if each is None else str(each) for each in (params.system, params.component))

@@ -295,8 +295,4 @@ def excerpt(text: str) -> str:
 
 def decoded(text: str) -> str:
     """Return text in which bytes that are not UTF-8 are read as Windows-1252."""
-    return _undecoded.sub(_from_windows, text)
-
-
-def _from_windows(byte: re.Match[str]) -> str:
-    return bytes((ord(byte[0]) - 0xDC00,)).decode("cp1252", "replace")
+    return _undecoded.sub(lambda byte: bytes((ord(byte[0]) - 0xDC00,)).decode("cp1252", "replace"), text)

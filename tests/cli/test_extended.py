@@ -93,7 +93,7 @@ def test_apply_reports_what_it_cannot_do(command: Command, put: Put, tmp_path: P
     invalid = command("apply", url, file, *CAMERA)
     assert (invalid.code, "CAM_NAME: 'Front' is not a number" in invalid.err) == (2, True)
     done = command("apply", url, file, *CAMERA, "--partial")
-    assert done.code == 1
+    assert done.code == 2
     assert "4 refused" in done.err, done.err
     assert "not on this vehicle" in done.out
     wrong = command("apply", put(Camera(component=101)), file, "--vehicle", "1/101")
