@@ -9,9 +9,10 @@ those for which it was stated. Each function runs in a transaction, which exclud
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import astuple, fields, replace
+from itertools import zip_longest
 from operator import attrgetter
 from typing import Any, Final
 
@@ -229,27 +230,12 @@ def save_table(tx: Transaction, update: TableUpdate, now: float, known: dict[tup
     gone = [name for name, row in rows.items() if row.stored and name not in names] if update.replace else []
     observed = [*update.params, *(StoredParam.gone(name, update.at) for name in gone)]
     is_known = before is not None and before.known_since is not None
-    agrees = is_whole = True
-    is_rehashed = False
-    loaded = known.get((owner, ""), 0)
+    is_whole, is_rehashed = True, False
     lines: list[Line] = []
-    first = min((item.heard_at for item in observed), default=update.at)
-    recent = lines_since(tx, owner, first - SAME_CHANGE_MAX)
-
-    def is_recorded(item: StoredParam) -> bool:
-        """Return whether another program has stored this change, and a later one."""
-        row, last = rows.get(item.name), known.get((owner, item.name), loaded)
-        for number, line in recent.get(item.name, ()):
-            is_near = number > last and line.at > item.heard_at - SAME_CHANGE_MAX
-            if is_near and is_same_value(line.new, item.stored):
-                known[owner, item.name] = number
-                return not is_same_value(row and row.stored, item.stored)
-        return False
-
-    for batch in _rounds(observed):
-        new = [item for item in batch if not is_recorded(item)]
-        agrees = agrees and len(new) == len(batch)
-        items = [_completed(item, rows.get(item.name), is_whole=update.replace) for item in new]
+    unrecorded = _unrecorded(tx, owner, observed, rows, known)
+    agrees = sum(map(len, unrecorded)) == len(observed)
+    for new in zip_longest(*unrecorded):
+        items = [_completed(item, rows.get(item.name), is_whole=update.replace) for item in new if item]
         for item, has_won in zip(items, _write_rows(tx, owner, items, horizon), strict=True):
             old = rows.get(item.name)
             is_same = is_same_value(old and old.stored, item.stored)
@@ -329,16 +315,30 @@ def _insert_by_time(tx: Transaction, owner: int, items: Iterable[StoredParam]) -
     return any(row.hashed != (old and old.hashed) for row in new_rows for old in [rows.get(row.name)])
 
 
-def _rounds(items: Iterable[StoredParam]) -> list[list[StoredParam]]:
-    """Return observations in rounds with different names: one parameter's are written in their order."""
-    rounds: list[list[StoredParam]] = []
-    count = Counter[str]()
-    for item in items:
-        if count[item.name] == len(rounds):
-            rounds.append([])
-        rounds[count[item.name]].append(item)
-        count[item.name] += 1
-    return rounds
+def _unrecorded(
+    tx: Transaction,
+    owner: int,
+    observed: Sequence[StoredParam],
+    rows: Mapping[str, StoredParam],
+    known: dict[tuple[int, str], int],
+) -> list[list[StoredParam]]:
+    """Return observations by parameter, in their order, without those that another program has stored with a
+    later change, or that were received before a change that it has stored."""
+    first = min((item.heard_at for item in observed), default=math.inf)
+    recent, loaded = lines_since(tx, owner, first - SAME_CHANGE_MAX), known.get((owner, ""), 0)
+    kept: dict[str, list[StoredParam]] = {}
+    for item in observed:
+        row, last = rows.get(item.name), known.get((owner, item.name), loaded)
+        is_kept = True
+        for number, line in recent.get(item.name, ()):
+            is_near = number > last and line.at > item.heard_at - SAME_CHANGE_MAX
+            if is_near and is_same_value(line.new, item.stored):
+                known[owner, item.name] = number
+                kept[item.name] = []
+                is_kept = is_same_value(row and row.stored, item.stored)
+                break
+        kept.setdefault(item.name, []).extend([item] * is_kept)
+    return list(kept.values())
 
 
 def _completed(item: StoredParam, old: StoredParam | None, *, is_whole: bool) -> StoredParam:

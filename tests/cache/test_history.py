@@ -54,6 +54,8 @@ def test_a_program_that_reads_late_repeats_no_change(cache: ParamCache, open_cac
     observe(cache, 0.0, 1, 2, 0, 1, 0)
     observe(late, 0.5, 1, 2, 0, 1, 0, 2)
     observe(cache, 1.2, 2, 0)
+    starting = [stored("PARAM_0", value, at=NOW + 2.95) for value in (1, 2, 0)]
+    open_cache().save(update(*starting, at=NOW + 6))
     assert [line[2:4] for line in lines(cache)] == [(0, 1), (1, 2), (2, 0), (0, 1), (1, 0), (0, 2), (2, 0)]
     assert values(cache) == {"PARAM_0": 0}
 
