@@ -195,6 +195,7 @@ async def save(
         found.append({"path": path, "format": written.value, "components": members})
         if not options.json:
             contents = [f"{counted(len(each), noun_of(each))} of {address(each)}" for each in of_file]
+            contents = [described(each) for each in of_file] if incomplete else contents
             say(f"{', '.join(contents)} written to {path} ({written})")
     if found and options.json:
         print_json(found[0] if len(found) == 1 else {"files": found})

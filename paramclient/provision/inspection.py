@@ -13,7 +13,7 @@ from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, ParamType, Settable, Trust
 from paramclient.provision.planning import Plan, PlanOptions, plan_from
-from paramclient.provision.sources import component_set, lacking
+from paramclient.provision.sources import component_set, part_set
 
 READS_IN_PROGRESS_MAX: Final = 64
 """Reads by name that are in progress at once, each in a task. The component itself sends fewer at a time."""
@@ -147,9 +147,8 @@ async def inspect(component: Component, wanted: ParamSet, absent: frozenset[str]
     known = {name: param for name, param in (table | found).items() if name not in unreported}
     lacks = [name for name in listed if name not in known]
     lacks += [f"index {each}" for each in sorted(missing.difference(each.index for each in listed.values()))]
-    source = lacking(component, f"vehicle {component.system}/{component.component}", lacks)
     return Inspection(
-        component_set(component, known.values(), source),
+        part_set(component, known.values(), f"vehicle {component.system}/{component.component}", lacks),
         complete,
         fetched.hash,
         (absent | unreported).difference(table),

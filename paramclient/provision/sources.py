@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
@@ -258,15 +258,16 @@ def fetched_set(component: Component, result: FetchResult, *, source: str, parti
             system=component.system,
             component=component.component,
         )
-    known = result.params.keys() - set(result.cached)
-    params = (each for name, each in result.params.items() if name in known)
-    return component_set(component, params, lacking(component, source, missing))
+    known = [name for name in result.params if name not in result.cached]
+    return part_set(component, [result.params[name] for name in known], source, missing)
 
 
-def lacking(component: Component, source: str, missing: Iterable[str]) -> str:
-    """Return the origin of a set with what it lacks: these parameters, and names that no file can hold."""
-    names = [*missing, *map(repr, sorted(component.session.table.left_out))]
-    return f"{source}, without {first_of(names, NAMES_SHOWN_MAX)}" if names else source
+def part_set(component: Component, params: Collection[Param], source: str, lacks: Iterable[str]) -> ParamSet:
+    """Return a set whose origin says what it lacks: these parameters, and names that no file can hold."""
+    if names := [*lacks, *map(repr, sorted(component.session.table.left_out))]:
+        kept = sum(param.index is not None for param in params)
+        source += f": {kept} of {component.count} parameters, without {first_of(names, NAMES_SHOWN_MAX)}"
+    return component_set(component, params, source)
 
 
 def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> ParamSet:
