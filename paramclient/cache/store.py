@@ -237,11 +237,9 @@ class ParamCache:
         key = self._read(lambda tx: self._choose(tx, vehicle))
         return self._store.run(lambda tx: tables.remove_tables(tx, key, component), writing=True)
 
-    def load_all(
-        self, summaries: Sequence[CachedSummary], *, extended: bool = False
-    ) -> list[CachedComponent]:
+    def load_all(self, listed: Sequence[CachedSummary], *, extended: bool = False) -> list[CachedComponent]:
         """Load tables as `load` does; another process may have removed one."""
-        found = (self.load(each.key, each.component, extended=extended) for each in summaries)
+        found = (self.load(each.key, each.component, extended=extended) for each in listed)
         return [each for each in found if each is not None]
 
     # history and snapshots
