@@ -26,7 +26,7 @@ from paramclient.cli.sources import described, filled, is_pattern_name, not_a_fi
 from paramclient.files import FileFormat, ParamFile
 from paramclient.model.names import age_in_words, is_pattern
 from paramclient.model.paramset import ParamSet
-from paramclient.provision.apply_restore import load_restore_point, restore_categories
+from paramclient.provision.apply_restore import OWN_STATE_CATEGORIES, load_restore_point, restore_categories
 from paramclient.provision.apply_rules import CATEGORIES, READ_ONLY
 from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
 from paramclient.provision.execution import run as run_apply
@@ -91,8 +91,7 @@ async def apply(
         metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for the
             ranges of values, and for parameters that take effect only after a reboot.
     """
-    load, options = await _from_file(file, options, partial=partial)
-    return await _run(url, options, load, metadata)
+    return await _run(url, *await _from_file(file, options, partial=partial), metadata)
 
 
 async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags = ApplyFlags()) -> int:
@@ -121,8 +120,7 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
         return await _run(url, options, bind(_earlier_state, moment))
     if ChosenVehicle.parse(options.vehicle).is_all and not is_pattern_name(when):
         raise errors.UsageError("with --vehicle all, the backup file needs {uid} or {system} in its name")
-    load, options = await _from_file(when, options, is_restore=True)
-    return await _run(url, options, load)
+    return await _run(url, *await _from_file(when, options, is_restore=True))
 
 
 async def reset(
@@ -150,9 +148,8 @@ async def reset(
     if bool(names) == all_:
         raise errors.UsageError("reset takes names, or --all")
     chosen = check_given(names)
-    load = bind(_defaults, chosen or ["*"], metadata)
     flags = replace(options, include=(*options.include, *(name.upper() for name in chosen)))
-    return await _run(url, flags, load, metadata)
+    return await _run(url, flags, bind(_defaults, chosen or ["*"], metadata), metadata)
 
 
 # The values to write
@@ -160,8 +157,8 @@ async def reset(
 
 async def _from_file(
     name: str, options: ApplyFlags, *, partial: bool = True, is_restore: bool = False
-) -> tuple[Load, ApplyFlags]:
-    """Return what gives each vehicle its values of a file, and the options for the kind of its parameters.
+) -> tuple[ApplyFlags, Load]:
+    """Return the options for the kind of a file's parameters, and what gives each vehicle its values.
 
     The file may also be a vehicle of the cache or a link; one with placeholders in its name is read for each
     vehicle. The values count as a vehicle's own if --vehicle or the name of the file has its hardware id, and
@@ -193,7 +190,7 @@ async def _from_file(
         return State(params, is_restore, partial, ExitCode.USAGE if file.left_out else ExitCode.DONE)
 
     is_extended = options.extended or (source is not None and source.is_extended)
-    return load, replace(options, extended=is_extended)
+    return replace(options, extended=is_extended), load
 
 
 async def _earlier_state(moment: float | int | None, session: CommandSession) -> State:
@@ -398,8 +395,7 @@ class _Job:
         found, session, options = self.found, self.session, self.options
         words = ", ".join(f"{count} {_WORDS.get(status, status)}" for status, count in found.counts.items())
         remarks = list[str]()
-        done = [row for row in found.rows.values() if row.status not in _WORDS]
-        is_whole = all(row.is_as_wanted for row in done)
+        is_whole = all(row.is_as_wanted for row in found.rows.values() if row.status not in _WORDS)
         code = max(self.state.code, ExitCode.DONE if is_whole else ExitCode.INCOMPLETE)
         if isinstance(found, Plan):
             made, end, late = found, "; nothing was sent", found.reboot_for + found.awaiting_reboot
@@ -425,6 +421,10 @@ class _Job:
             if left_out := Counter(row.category for row in found.shown_rows if row.category in _INCLUDABLE):
                 counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
                 includes = " ".join(f"--include {category}" for category in left_out)
+                uid, origin = session.component.identity.uid, self.state.params.identity
+                is_own = uid is not None and origin is not None and origin.uid == uid
+                own = ", ".join(each for each in left_out if is_own and each in OWN_STATE_CATEGORIES)
+                includes += f"; restore writes this vehicle's own {own} too" if own else ""
                 remarks.append(f"left out: {counts}; to write them: {includes}")
             if late:
                 remarks.append(f"takes effect after a reboot: {listed(late)}")

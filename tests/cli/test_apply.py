@@ -61,7 +61,7 @@ def test_apply_sets_and_verifies_values_that_differ(command: Command, put: Put, 
     vehicle = copter()
     outcome = command("apply", put(vehicle), file())
     assert outcome.code == 0
-    left_out = "left out: it was measured on one vehicle, and is wrong on every other"
+    left_out = "left out: it was measured on one vehicle, and is right only there"
     assert outcome.rows == [
         ["name", "before", "wanted", "now", "status", "reason"],
         ["RTL_ALT", "1500", "2500", "2500", "accepted"],
@@ -224,6 +224,8 @@ def test_a_backup_restores_the_calibration_of_the_very_same_vehicle(
     assert vehicle.values["COMPASS_OFS_X"] == 9.0
     for words in ([named], [anonymous, "--vehicle", f"uid:{named.stem}"]):
         vehicle.set_param("COMPASS_OFS_X", 9.0)
+        applied = command("apply", put(vehicle), *words)
+        assert "; restore writes this vehicle's own calibration too\n" in applied.err
         assert command("restore", put(vehicle), *words).code == 0
         assert vehicle.values["COMPASS_OFS_X"] == 5.0
 
