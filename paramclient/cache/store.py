@@ -24,7 +24,7 @@ from paramclient.cache.records import (
     StoredTable,
     TableUpdate,
 )
-from paramclient.cache.tables import ensure_table, import_tables, save_table
+from paramclient.cache.tables import KnownLines, ensure_table, import_tables, save_table
 from paramclient.errors import NotInCache, UsageError
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
@@ -85,7 +85,7 @@ class ParamCache:
                     raise UsageError(f"{self.path} is another file, and no cache; it is not touched")
             self._store = SqliteStore(self.path)
         self.place = self._store.place
-        self._known_lines: dict[tuple[int, str], int] = {}
+        self._known_lines: KnownLines = {}
 
     def __enter__(self) -> ParamCache:
         return self
@@ -130,7 +130,7 @@ class ParamCache:
         """
         updates = (update,) if isinstance(update, TableUpdate) else tuple(update)
 
-        def work(tx: Transaction) -> dict[tuple[int, str], int]:
+        def work(tx: Transaction) -> KnownLines:
             known = dict(self._known_lines)
             for each in updates:
                 save_table(tx, each, time.time(), known)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import astuple, fields, replace
 from itertools import zip_longest
 from operator import attrgetter
@@ -198,6 +198,12 @@ _UPSERT: Final = """
 """The last value is the time after which stored times are from before the clock was set back."""
 
 
+KnownLines = dict[tuple[int, str], int]
+"""The last line that a program has written, or has received too, by table and name; with no name, the last
+when it loaded the table. Another program may have written later ones of changes that this one, on a busy
+computer, receives late."""
+
+
 def ensure_table(
     tx: Transaction, identity: Identity, component: int, at: float, *, extended: bool
 ) -> StoredTable:
@@ -208,16 +214,14 @@ def ensure_table(
     return _upsert_table(tx, new, math.inf) if found is None else found
 
 
-def save_table(tx: Transaction, update: TableUpdate, now: float, known: dict[tuple[int, str], int]) -> None:
+def save_table(tx: Transaction, update: TableUpdate, now: float, known: KnownLines) -> None:
     """Write an update with its history lines.
 
     Args:
         tx: the transaction.
         update: the update.
         now: the current time in unix seconds.
-        known: the last line that the program has written, or has received too, by table and name; with no
-            name, the last when it loaded the table. Another program may have written later ones of changes
-            that this one, on a busy computer, receives late.
+        known: the lines that the program knows; updated.
     """
     horizon = max(now, update.at) + CLOCK_SLACK
     before = find_table(tx, update.identity.key, update.component, extended=update.extended)
@@ -316,18 +320,14 @@ def _insert_by_time(tx: Transaction, owner: int, items: Iterable[StoredParam]) -
 
 
 def _unrecorded(
-    tx: Transaction,
-    owner: int,
-    observed: Sequence[StoredParam],
-    rows: Mapping[str, StoredParam],
-    known: dict[tuple[int, str], int],
+    tx: Transaction, owner: int, items: Sequence[StoredParam], rows: dict[str, StoredParam], known: KnownLines
 ) -> list[list[StoredParam]]:
     """Return observations by parameter, in their order, without those that another program has stored with a
     later change, or that were received before a change that it has stored."""
-    first = min((item.heard_at for item in observed), default=math.inf)
+    first = min((item.heard_at for item in items), default=math.inf)
     recent, loaded = lines_since(tx, owner, first - SAME_CHANGE_MAX), known.get((owner, ""), 0)
     kept: dict[str, list[StoredParam]] = {}
-    for item in observed:
+    for item in items:
         row, last = rows.get(item.name), known.get((owner, item.name), loaded)
         is_kept = True
         for number, line in recent.get(item.name, ()):

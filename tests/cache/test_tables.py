@@ -55,8 +55,7 @@ def test_a_table_is_read_as_it_was_written(cache: ParamCache, open_cache: Open) 
     default = replace(params[1], name="WITH_DEFAULT", index=6, default=-5)
     table = [*params, raw, default]
     cache.save(update(*(StoredParam.of(each, NOW) for each in table), table=TableState(None, 7)))
-    found = open_cache().load(PX4.key, 1)
-    assert found is not None
+    found = open_cache().component(PX4.key)
     assert {name: (param, param.default) for name, param in found.params.items()} == {
         each.name: (each, each.default) for each in table
     }
@@ -88,8 +87,7 @@ def test_extended_parameters_are_apart(cache: ParamCache) -> None:
     number = ext_param("P_1", b"\7\0", ParamType.UINT16, 1, Trust.CACHED)
     rows = [StoredParam.of(each, NOW) for each in (text, number)]
     cache.save(update(*rows, table=TableState(count=2, complete=True), component=100, extended=True))
-    found = cache.load(PX4.key, 100, extended=True)
-    assert found is not None
+    found = cache.component(PX4.key, component=100, extended=True)
     assert dict(found.params) == {"P_0": text, "P_1": number}
     assert (found.count, found.complete) == (2, True)
     assert found.params["P_0"].value == "café"

@@ -213,6 +213,19 @@ async def test_a_set_of_another_station_right_behind_an_acknowledgement_is_the_l
         assert [each.new and each.new.value for each in conversation.changes][-2:] == [6, 7]
 
 
+async def test_an_acknowledgement_counts_however_many_frames_are_sent_before_it() -> None:
+    """The numbers of frames wrap: its own seems to be lower than that of the known value."""
+
+    def answers(message: ParamSet) -> list[Message]:
+        answer = ParamValue("A", message.raw, ParamType.INT32, 1, 0)
+        return [*[answer._replace(param_id="B")] * 200, answer]
+
+    async with talking(Partial(NUMBER, on_set=answers)) as (_, session):
+        for value in (6, 7):
+            await write(session, "A", value)
+            assert session.table.params["A"].value == value
+
+
 async def test_a_late_answer_with_an_old_value_undoes_no_change() -> None:
     """ArduPilot takes the value of a read when it queues it, and answers up to 100 ms later."""
     vehicle = ArduPilotVehicle(live_period=0.0)
