@@ -149,9 +149,7 @@ _app: Final = App(
 )
 _cache: Final = App(name="cache", help="List or remove tables in the cache. Needs no link.", help_epilogue="")
 _signing: Final = App(name="signing", help="Set and remove the signing key of a vehicle.", help_epilogue="")
-_metadata: Final = App(
-    name="metadata", help="Add, list or remove files that describe parameters.", help_epilogue=""
-)
+_metadata: Final = App(name="metadata", help="Add, list or remove metadata of parameters.", help_epilogue="")
 
 
 def _add(group: App, function: str, arguments: str = "", *examples: str) -> None:

@@ -15,6 +15,7 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient import errors
+from paramclient.cache import ParamCache
 from paramclient.cache.moments import parse_moment
 from paramclient.cli.json_output import JsonObject, apply_json, plan_json, row_json, rows_json
 from paramclient.cli.metadata import MetadataChoice, default_in, known_of_session, say_sources
@@ -265,8 +266,15 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
         The exit code.
 
     Raises:
+        CacheError: the cache, which takes the state before, cannot be written.
         FileError: a file of --backup exists, or names several vehicles' backups, or a vehicle has no file.
     """
+    if not (flags.dry_run or flags.no_cache):  # that nothing is sent is known at once, not after a warning
+        try:
+            with ParamCache(flags.cache) as cache:
+                await anyio.to_thread.run_sync(bind(cache.save, (), durable=True))
+        except errors.CacheError as failure:
+            raise errors.CacheError(f"nothing was sent: {failure}; --no-cache does without") from failure
     async with sessions(url, flags, writes=True) as found:
         jobs, backups = dict[CommandSession, _Job](), set[str]()
 

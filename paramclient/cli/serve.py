@@ -75,14 +75,9 @@ async def serve(
             print_line(f"ground stations: {endpoint.address}")
         print_line(f"serving on {url}")
 
+    users = None if tokens is None else service.read_tokens(tokens)
     with on_end_signal(stop.set):
-        await service.serve(
-            hub,
-            listen,
-            tokens=None if tokens is None else service.read_tokens(tokens),
-            stop=stop,
-            listens=started,
-        )
+        await service.serve(hub, listen, tokens=users, stop=stop, listens=started)
 
 
 def token(name: str, /, *, file: Path, read: bool = False) -> None:

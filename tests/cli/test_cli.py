@@ -365,10 +365,8 @@ def test_a_failed_link_is_exit_code_4(live_command: Command, put: Put) -> None:
     url = put(Dropping(GenericVehicle({"A": 1, "B_ENABLE": 1})))
     done = live_command("set", url, "A", 2, "B_ENABLE", 3, "--json", "--no-cache")
     assert done.code == 4
-    assert [(each["status"], each["error"]) for each in done.json["results"]] == [
-        ("unknown", "LinkError"),
-        ("not tried", "LinkError"),
-    ]
+    found = [(each["status"], each["error"]) for each in done.json["results"]]
+    assert found == [("unknown", "LinkError"), ("not tried", "LinkError")]
 
 
 def test_a_failed_cache_is_exit_code_5_and_only_a_warning_for_fetch(
@@ -382,6 +380,9 @@ def test_a_failed_cache_is_exit_code_5_and_only_a_warning_for_fetch(
     fetched = command("fetch", put(GenericVehicle({"A": 1})), "--json", "--cache", tmp_path)
     assert (fetched.code, fetched.json["received"]) == (0, 1)
     assert fetched.err.startswith("paramclient: warning: continuing without the cache: ")
+    for words in (["restore", "sim:px4"], ["reset", "sim:px4", "MC_*"]):
+        refused = command(*words, "--cache", tmp_path)
+        assert (refused.code, refused.err.count("\n"), "nothing was sent: " in refused.err) == (5, 1, True)
 
 
 def test_every_error_has_an_exit_code() -> None:
