@@ -94,11 +94,13 @@ async def download_list(session: Session) -> ListResult:
     """
     channel = session.channel
     with channel.inbox(session.dialect.value) as inbox:
+        session.reading.setdefault(None, anyio.current_time())
         try:
             download = _Download(session, inbox)
             await download.begin()
             await download.run()
         finally:
+            session.reading.pop(None, None)
             channel.is_streaming = False
     return download.result
 

@@ -85,7 +85,7 @@ async def _read(session: Session, which: str | int, alias: str | int | None = No
         if must_wait and channel.is_lost:  # while others were read
             raise NoReply(_what(session, which), attempts=0, waited=anyio.current_time() - began)
         is_first = which not in session.reading
-        session.reading.add(which)
+        session.reading.setdefault(which, anyio.current_time())
         try:
             with channel.inbox(*((session.dialect.value, each) for each in (which, alias))) as inbox:
                 try:
@@ -107,7 +107,7 @@ async def _read(session: Session, which: str | int, alias: str | int | None = No
                     return await _ask(session, inbox, which, channel.timing.attempts_for(CONTROL_LOST))
         finally:
             if is_first:
-                session.reading.discard(which)
+                del session.reading[which]
     raise _unknown(session, which, ": it does not respond to reads of this name, but to others")
 
 

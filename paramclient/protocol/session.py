@@ -10,7 +10,7 @@ from typing import Any, Final, Generic, TypeVar
 import anyio
 
 from paramclient.errors import AnotherVehicle, NoReply
-from paramclient.model.values import Encoding, Param, ParamType
+from paramclient.model.values import Encoding, Param, ParamType, Trust
 from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
 from paramclient.protocol.ftp import FTP_SILENT_TIME, SILENT_LOST
@@ -142,7 +142,7 @@ class Session:
     Attributes:
         table: the current values.
         fetching: the fetch that is in progress, shared by all callers.
-        reading: names and indices whose reads are in progress.
+        reading: by name or index when a read in progress began; by None, when the list did.
         writing: the authors of the writes in progress, by name.
         sent: by name, the bytes that they have sent.
         serves_file: whether the parameter file was served on this link; None while unknown.
@@ -175,7 +175,7 @@ class Session:
         self.table = Table(dialect)
         self.table.author_of = self._author_of
         self.fetching: Shared[Any] = Shared(spawn, channel.gate)
-        self.reading: set[str | int] = set()
+        self.reading: dict[str | int | None, float] = {}
         self.writing: dict[str, str] = {}
         self.sent: dict[str, bytes] = {}
         self.serves_file: bool | None = None
@@ -199,7 +199,8 @@ class Session:
     def receive(self, message: ReportedValue, now: float, sequence: int) -> float | None:
         """Store a value, unless it may be older than the known one.
 
-        Then, return the time at which only the parameter's present value can be received.
+        Then, return the time at which only the parameter's present value can be received. A first value may
+        have waited for a busy program, and is as old as its request: another program may know a later one.
 
         Args:
             message: the value.
@@ -224,12 +225,15 @@ class Session:
         is_overtaken = may_read and 0 < behind < 128 and now <= until
         if is_overtaken and is_other and not is_sent:
             return until
-        is_late = replaced is not None and now <= replaced.until
+        asked = min(self.reading.get(each, now) for each in (name, message.param_index))
+        is_late = replaced is not None and (now <= replaced.until or asked < replaced.until - LATE_TIME)
         if replaced is not None and is_late and is_other:
             was_it = any(table.is_reported(each, raw, message.param_type) for each in replaced.params)
             if is_answer or (was_it and not is_sent):
                 return replaced.until
-        table.store(message, now, is_exact=is_sent)
+        is_first = (known is None or known.trust is not Trust.LIVE) and not is_sent
+        moment = min(asked, self.reading.get(None, now)) if is_first else now
+        table.store(message, moment, is_exact=is_sent)
         if name in table.params and not is_overtaken:
             self._sequences[name] = sequence
         if known is not None and may_read and self.identification.is_ardupilot and not is_answer:
@@ -336,8 +340,6 @@ class Session:
             del self._foreign_sets[next(iter(self._foreign_sets))]
 
     def _author_of(self, name: str) -> str:
-        author = self.writing.get(name)
-        if author is not None:
-            return author
-        station, at = self._foreign_sets.get(name, ("", 0.0))
-        return station if station and self.table.moments[name] - at <= FOREIGN_SET_MEMORY else "vehicle"
+        station, at = self._foreign_sets.get(name, ("", -math.inf))
+        is_recent = self.table.moments[name] - at <= FOREIGN_SET_MEMORY
+        return self.writing.get(name) or (station if is_recent else "vehicle")

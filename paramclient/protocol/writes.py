@@ -15,7 +15,6 @@ import anyio
 from paramclient.errors import (
     AnotherVehicle,
     ExtAckResult,
-    ExtSetRefused,
     LinkError,
     NoReply,
     ParamClientError,
@@ -307,7 +306,9 @@ class _Write:
                     return shown
         refused = None
         if isinstance(answer, ParamExtAck) and answer.param_result not in EXT_TAKEN:
-            refused = self._ext_refusal(answer.param_result)
+            kind = ValueUnsupported if answer.param_result == ExtAckResult.VALUE_UNSUPPORTED else SetFailed
+            why = f"{channel} refused {self.name}: {ExtAckResult.name_of(answer.param_result)}"
+            refused = kind(why, *channel.target, code=answer.param_result, name=self.name)
         elif isinstance(answer, Param) and answer.type == self.before.type:
             return answer
         if not channel.is_silent(self._began):
@@ -405,11 +406,6 @@ class _Write:
         except UsageError as error:
             what = f"{self.name} of {self.channel} is {answer.type.name} now: {error}"
             raise TypeMismatch(what, *self.channel.target, name=self.name) from None
-
-    def _ext_refusal(self, result: int) -> ExtSetRefused:
-        kind = ValueUnsupported if result == ExtAckResult.VALUE_UNSUPPORTED else SetFailed
-        what = f"{self.channel} refused {self.name}: {ExtAckResult.name_of(result)}"
-        return kind(what, *self.channel.target, code=result, name=self.name)
 
     def _not_applied(self, actual: Param) -> ValueNotApplied:
         target, kept = self.channel.target, actual.settable
