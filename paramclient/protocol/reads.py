@@ -74,7 +74,7 @@ def _reads_by_index(session: Session) -> bool:
     An ArduPilot repeats the index in its answer, which tells that from the acknowledgement of a set.
     """
     is_told = session.identification.is_ardupilot and session.serves_reads.get(int) is not False
-    return session.reads_by_index or (is_told and session.table.is_complete)
+    return session.reads_by_index or (is_told and bool(session.table.is_complete or session.serves_file))
 
 
 async def _read(session: Session, which: str | int, alias: str | int | None = None) -> ReportedValue:

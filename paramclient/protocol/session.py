@@ -236,7 +236,7 @@ class Session:
         table.store(message, moment, is_exact=is_sent)
         if name in table.params and not is_overtaken:
             self._sequences[name] = sequence
-        if known is not None and may_read and self.identification.is_ardupilot and not is_answer:
+        if known is not None and may_read and not is_answer:
             before = replaced.params if replaced is not None and is_late else []
             params = [*before, known][-REPLACED_MAX:] if is_other else before
             self.replaced[name] = Replaced(params, now + LATE_TIME)

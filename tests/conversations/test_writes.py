@@ -248,6 +248,24 @@ async def test_a_late_answer_with_an_old_value_undoes_no_change() -> None:
         assert session.table.params["ATC_ANG_RLL_P"].value == 10.0
 
 
+async def test_a_busy_program_knows_a_late_answer_by_when_it_was_requested() -> None:
+    endpoint = Tap(vehicle := ArduPilotVehicle(live_period=0.0))
+    async with talking(endpoint) as (conversation, session):
+        await fetch_all(session)
+        endpoint.down = lambda message: not isinstance(message, ParamValue)
+        old = session.table.params["ATC_ANG_RLL_P"]
+        answer = ParamValue(old.name, struct.pack("<f", old.value), 9, len(session.table.params), old.index)
+        async with meanwhile(read(session, old.name)):
+            await anyio.sleep(0.05)
+            vehicle.set_param(old.name, 7.0)
+            conversation.hear(answer._replace(raw=struct.pack("<f", 7.0), param_index=65535))
+            await anyio.sleep(0.4)
+            conversation.hear(answer)
+            endpoint.down = lambda message: True
+        await anyio.sleep(1.0)
+        assert [each.new and each.new.value for each in conversation.changes][-1:] == [7.0]
+
+
 @pytest.mark.parametrize(("vehicle", "reorder"), [(PX4Vehicle(), 0.5), (ArduPilotVehicle(), 0.0)])
 async def test_changes_are_received_in_their_order(vehicle: Vehicle, reorder: float) -> None:
     """A value that others overtake, or that an ArduPilot has kept for a read, is none."""
