@@ -17,6 +17,7 @@ from typing import Final, Literal, TypeAlias, get_args
 from paramclient.errors import FileError, UsageError
 from paramclient.files.disk import read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT
+from paramclient.files.reading import decoded
 from paramclient.metadata.info import Metadata
 from paramclient.model.identity import Identity, autopilot_name, version_text
 from paramclient.model.paramset import ParamSet
@@ -96,7 +97,7 @@ def naming(source: str) -> Iterator[None]:
 
 
 def json_of(content: bytes) -> dict[str, object]:
-    """Parse a JSON object.
+    """Parse a JSON object. Bytes that are not UTF-8 are read as Windows-1252.
 
     Raises:
         UsageError: the text is not a JSON object.
@@ -104,7 +105,7 @@ def json_of(content: bytes) -> dict[str, object]:
     from pydantic_core import from_json  # imported here: loads pydantic
 
     try:
-        document = from_json(content)
+        document = from_json(decoded(content.decode("utf-8", "surrogateescape")))
     except ValueError as error:
         raise UsageError(f"not JSON: {error}") from None
     if not isinstance(document, dict):

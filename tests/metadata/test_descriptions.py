@@ -242,10 +242,7 @@ WRONG = {
     "no list": (b'{"version": 1, "parameters": {"A": 1}}', r"parameters: Input should be a valid list"),
     "no name": (px4({"type": "Float"}), r"parameters\[0\].name: Field required"),
     "long name": (px4({"name": "A" * 17}), r"parameters\[0\].name: String should have at most 16"),
-    "number for a text": (
-        px4({"name": "A", "units": 7}),
-        r"parameters\[0\].units: Input should be a valid string",
-    ),
+    "no text": (px4({"name": "A", "units": 7}), r"parameters\[0\].units: Input should be a valid string"),
     "high bit": (px4({"name": "A", "bitmask": [{"index": 64}]}), r"parameters\[0\].bitmask\[0\].index"),
     "ardupilot list": (b'{"json": {}, "A": {"B": {"Values": [1]}}}', r"B.Values"),
     "html": (b"<html><body/></html>", "begins with <html>, not with <paramfile>"),
@@ -277,6 +274,11 @@ def test_a_document_type_is_rejected(text: str, encoding: str) -> None:
     said = "document type" if encoding == "utf-8" else "neither JSON nor XML"
     with pytest.raises(FileError, match=said):
         read_content(content, source="the file")
+
+
+def test_a_description_in_another_encoding_is_read() -> None:
+    content = px4({"name": "A", "shortDesc": "H?he"}).replace(b"?", b"\xf6")
+    assert read_content(content, source="the file")["A"].short_description == "Höhe"
 
 
 def test_empty_ranges_and_invalid_values_are_left_out() -> None:
