@@ -54,11 +54,13 @@ def opcodes(conversation: Conversation) -> list[int]:
     return [Packet.unpack(each.payload).opcode for each in conversation.sent_of(FileTransfer)]
 
 
-def check(vehicle: ArduPilotVehicle, node: Node, result: FetchResult) -> None:
-    """Check that every value is the vehicle's, and that nothing is merely cached."""
+async def fetched(vehicle: ArduPilotVehicle, node: Node) -> FetchResult:
+    """Fetch, and check that every value is the vehicle's, and that nothing is merely cached."""
+    result = await fetch_all(node.plain)
     for param in vehicle.listed:
         assert result.params[param.name].same_value(param), param.name
     assert not any(each.trust is Trust.CACHED for each in node.plain.table.params.values())
+    return result
 
 
 @virtual_on_both
@@ -67,13 +69,12 @@ async def test_an_unchanged_table_costs_one_request_and_opens_nothing() -> None:
     async with converse(Air.symmetric([vehicle], delay=0.02)) as conversation:
         node = await with_cached_table(conversation, vehicle.params)
         began = anyio.current_time()
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert anyio.current_time() - began < 0.05
         assert (result.source, result.changed, result.notes) == ("cache", (), ())
         assert result.hash is not None
         assert opcodes(conversation) == [Opcode.CALC_FILE_CRC32]
         assert {each.trust for each in result.params.values()} == {Trust.VERIFIED}
-        check(vehicle, node, result)
 
 
 @pytest.mark.parametrize(("delay", "seconds"), [(0.004, 0.05), (0.05, 0.12)])
@@ -87,9 +88,8 @@ async def test_seconds_that_were_counted_need_no_read(delay: float, seconds: flo
         node = await with_cached_table(conversation, cached)
         vehicle.load({"STAT_RUNTIME": int(cached["STAT_RUNTIME"].value) + passed})
         sent, began = len(conversation.sent), anyio.current_time()
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert (result.source, result.changed) == ("cache", ())
-        check(vehicle, node, result)
         assert anyio.current_time() - began < seconds
         assert sum(map(len, conversation.sent[sent:])) < 350  # the answers are shorter
         assert not conversation.sent_of(ParamRequestRead)
@@ -109,9 +109,8 @@ async def test_pressure_that_a_rover_measures_all_the_time_needs_no_read() -> No
             await anyio.sleep(30)
             node.plain.table.doubt()
             sent = len(conversation.sent)
-            result = await fetch_all(node.plain)
+            result = await fetched(vehicle, node)
             assert (result.source, result.changed) == ("cache", ())
-            check(vehicle, node, result)
             assert len(conversation.sent_of(ParamRequestRead)) <= reads
             assert reads or sum(map(len, conversation.sent[sent:])) < 350  # the answers are shorter
 
@@ -129,9 +128,8 @@ async def test_a_value_that_moves_between_two_requests_starts_no_search() -> Non
     async with converse(Tap(vehicle, up=passes)) as conversation:
         vehicle.load({"STAT_RUNTIME": 30})
         node = await with_cached_table(conversation, cached)
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert result.source == "cache"
-        check(vehicle, node, result)
         assert len(opcodes(conversation)) <= 6
 
 
@@ -151,9 +149,8 @@ async def test_pressure_that_moves_between_requests_costs_a_round_trip(after: in
     async with converse(Air.symmetric([Tap(vehicle, down=passes)], delay=0.05)) as conversation:
         node = await with_cached_table(conversation, vehicle.params)
         began = anyio.current_time()
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert (result.source, result.changed) == ("cache", ())
-        check(vehicle, node, result)
         assert anyio.current_time() - began < 0.35 + 0.2 * is_lost
         assert not is_lost or len(set(conversation.sent_of(FileTransfer))) <= 10
 
@@ -165,9 +162,8 @@ async def test_values_that_move_are_read_by_their_checksum_and_learnt() -> None:
         cached = vehicle.params
         vehicle.load({"STAT_RUNTIME": 4711, "BARO1_GND_PRESS": 94_000.5, "ATC_RAT_RLL_P": 0.25})
         node = await with_cached_table(conversation, cached)
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert (result.source, result.changed) == ("cache", ("ATC_RAT_RLL_P",))
-        check(vehicle, node, result)
         assert node.plain.table.volatile >= {"STAT_RUNTIME"}
 
 
@@ -180,9 +176,8 @@ async def test_an_announcement_before_the_cached_table_takes_no_index_away() -> 
         conversation.hear(ParamValue("STAT_RUNTIME", value, ParamType.INT32, 1382, NO_INDEX))
         assert node.plain.table.params["STAT_RUNTIME"].index is None
         await with_cached_table(conversation, vehicle.params)
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert (result.source, result.missing) == ("cache", ())
-        check(vehicle, node, result)
 
 
 @virtual
@@ -193,9 +188,8 @@ async def test_a_restart_is_recognized_by_the_boot_count() -> None:
         node = await with_cached_table(conversation, cached)
         vehicle.load({name: cached[name].value * 2 + 1 for name in MOVED})  # type: ignore[operator]  # numbers
         sent, began = len(conversation.sent), anyio.current_time()
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert (result.source, result.changed) == ("cache", ())
-        check(vehicle, node, result)
         assert sum(map(len, conversation.sent[sent:])) < 2_000
         assert anyio.current_time() - began < 0.4
 
@@ -209,11 +203,10 @@ async def test_two_values_changed_by_others_are_found_and_named() -> None:
         node = await with_cached_table(conversation, cached)
         vehicle.load({"ATC_RAT_RLL_P": 0.25, "FORMAT_VERSION": 121})
         sent, began = len(conversation.sent), anyio.current_time()
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert (result.source, set(result.changed)) == ("cache", {"ATC_RAT_RLL_P", "FORMAT_VERSION"})
         assert "ATC_RAT_RLL_P" in result.notes[0]
         assert result.params["ATC_RAT_RLL_P"].default == 0.135
-        check(vehicle, node, result)
         assert sum(map(len, conversation.sent[sent:])) < 1_000
         assert anyio.current_time() - began < 0.2
         changes = {each.name: each.by for each in conversation.changes}
@@ -233,9 +226,8 @@ async def test_changed_values_are_found_in_less_time_than_the_file_takes() -> No
         vehicle.load(values)
         async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
             node = await with_cached_table(conversation, cached, count=len(cached) or None)
-            result = await fetch_all(node.plain)
+            result = await fetched(vehicle, node)
             assert (result.source, set(result.changed)) == ("cache" if cached else "ftp", set(values))
-            check(vehicle, node, result)
             elapsed.append(result.elapsed)
     assert max(elapsed[1:]) < elapsed[0]
 
@@ -252,8 +244,7 @@ async def test_a_search_ends_where_the_file_is_quicker(delay: float, is_simple: 
         vehicle.load({name: at + (2.5 if is_simple else 1 / 7) for at, name in enumerate(names)})
         async with converse(Air.symmetric([vehicle], delay=delay)) as conversation:
             node = await with_cached_table(conversation, cached)
-            result = await fetch_all(node.plain)
-            check(vehicle, node, result)
+            result = await fetched(vehicle, node)
             assert result.elapsed < 0.45 + 6 * 2 * delay  # the file takes 0.37 s and 3 round trips
 
 
@@ -265,9 +256,8 @@ async def test_a_changed_count_costs_one_round_trip() -> None:
         vehicle.load({"EK2_ENABLE": 1})
         async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
             node = await with_cached_table(conversation, cached, count=len(cached) or None)
-            result = await fetch_all(node.plain)
+            result = await fetched(vehicle, node)
             assert result.source == "ftp"
-            check(vehicle, node, result)
             elapsed.append(result.elapsed)
     assert elapsed[1] - elapsed[0] < 0.12
 
@@ -298,8 +288,7 @@ async def test_a_value_that_is_another_at_each_read_ends_the_search() -> None:
         node = await with_cached_table(conversation, vehicle.params)
         vehicle.load({"ATC_RAT_RLL_P": 0.25})
         began = anyio.current_time()
-        result = await fetch_all(node.plain)
-        check(vehicle, node, result)
+        await fetched(vehicle, node)
         assert anyio.current_time() - began < 2.0
 
 
@@ -315,7 +304,7 @@ def test_loss_leaves_nothing_wrong(loss: float, changed: dict[str, float]) -> No
             vehicle.load(changed)
             async with converse(Air.symmetric([vehicle], loss=loss, delay=0.05, seed=seed)) as conversation:
                 node = await with_cached_table(conversation, cached)
-                check(vehicle, node, await fetch_all(node.plain))
+                await fetched(vehicle, node)
 
     run(main)
 
@@ -360,12 +349,11 @@ async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None
     async with converse(Tap(vehicle, up=passes)) as conversation:
         node = await with_cached_table(conversation, cached)
         began = anyio.current_time()
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         source, reason = CASES[kind]
         assert result.source == source
         assert reason in " ".join(result.notes)
         assert anyio.current_time() - began < 3.0
-        check(vehicle, node, result)
 
 
 @pytest.mark.parametrize("late", [0.0, 2.0])
@@ -409,11 +397,10 @@ async def test_another_stations_open_file_costs_one_request() -> None:
         data = encode(FileTransfer(0, 1, 1, opening.pack()), system=252, component=190, sequence=0)
         vehicle.receive(data, anyio.current_time())
         await anyio.sleep(0.1)
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert result.source != "cache"
         assert "INVALID_SESSION" in " ".join(result.notes).upper().replace(" ", "_")
         assert opcodes(conversation).count(Opcode.CALC_FILE_CRC32) == 1
-        check(vehicle, node, result)
 
 
 NAMES = [param.name for param in ArduPilotVehicle().listed]
@@ -441,9 +428,8 @@ def test_no_difference_is_ever_taken_for_equal(changes: dict[str, int], kind: st
             del cached[NAMES[-1]]
         async with converse(vehicle) as conversation:
             node = await with_cached_table(conversation, {each.name: each for each in cached.values()})
-            result = await fetch_all(node.plain)
+            result = await fetched(vehicle, node)
             assert set(result.params) == set(vehicle.params)
-            check(vehicle, node, result)
 
     run(main)
 
@@ -485,9 +471,8 @@ async def test_a_value_makes_up_for_no_other_name_or_type(
     change(cached, *names)
     async with converse(vehicle) as conversation:
         node = await with_cached_table(conversation, cached)
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert set(result.params) == set(vehicle.params)
-        check(vehicle, node, result)
 
 
 @virtual
@@ -504,10 +489,9 @@ async def test_a_change_in_the_middle_of_a_proof_is_not_proven() -> None:
                 conversation.hear(ParamValue("ATC_RAT_RLL_P", value, ParamType.REAL32, 1434, NO_INDEX))
 
             tasks.start_soon(change)
-            result = await fetch_all(node.plain)
+            result = await fetched(vehicle, node)
         assert not result.missing
         assert len(result.params) == 1434
-        check(vehicle, node, result)
 
 
 @virtual
@@ -521,9 +505,8 @@ async def test_an_acknowledgement_as_real32_changes_no_type() -> None:
             before = vehicle.param(name)
             await write(node.plain, name, before.value)
             assert node.plain.table.params[name].same_value(before)
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert (result.source, result.changed) == ("cache", ())
-        check(vehicle, node, result)
 
 
 @virtual
@@ -534,9 +517,8 @@ async def test_a_list_with_a_gap_in_its_names_is_no_question_for_a_checksum() ->
     async with converse(vehicle) as conversation:
         node = await with_cached_table(conversation, cached, count=1382)
         node.plain.table.names[9] = node.plain.table.names[8]
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert result.source == "ftp"
-        check(vehicle, node, result)
 
 
 @pytest.mark.parametrize("is_cached", [True, False], ids=["cached", "downloaded"])
@@ -598,6 +580,5 @@ async def test_a_run_time_of_an_old_table_is_no_guess_that_hides_another_change(
     async with converse(vehicle) as conversation:
         moments = dict.fromkeys(cached, -365 * 86_400.0)
         node = await with_cached_table(conversation, cached, moments=moments)
-        result = await fetch_all(node.plain)
+        result = await fetched(vehicle, node)
         assert (result.source, result.changed) == ("cache", (name,))
-        check(vehicle, node, result)

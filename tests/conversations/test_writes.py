@@ -254,7 +254,7 @@ async def test_a_busy_program_knows_a_late_answer_by_when_it_was_requested() -> 
         await fetch_all(session)
         endpoint.down = lambda message: not isinstance(message, ParamValue)
         old = session.table.params["ATC_ANG_RLL_P"]
-        answer = ParamValue(old.name, struct.pack("<f", old.value), 9, len(session.table.params), old.index)
+        answer = ParamValue(old.name, struct.pack("<f", old.value), 9, 1382, old.index or 0)
         async with meanwhile(read(session, old.name)):
             await anyio.sleep(0.05)
             vehicle.set_param(old.name, 7.0)

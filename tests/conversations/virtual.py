@@ -23,6 +23,7 @@ from paramclient.protocol.table import Change
 from paramclient.sim import Endpoint
 from paramclient.wire.frames import Framer
 from paramclient.wire.messages import DECODED_IDS, Heartbeat, Message, decode, encode
+from tests import shell
 from tests.shell import SimulatedTimeLoop, outcome, simulated_time_loop
 
 T = TypeVar("T")
@@ -191,7 +192,7 @@ def messages_in(data: bytes) -> list[Message]:
     return [message for frame in frames if (message := decode(frame)) is not None]
 
 
-class Tap:
+class Tap(shell.Tap):
     """An endpoint behind a filter: messages to it and from it are passed on where a function says so.
 
     Args:
@@ -206,26 +207,18 @@ class Tap:
         up: Callable[[Message], bool] = lambda message: True,
         down: Callable[[Message], bool] = lambda message: True,
     ) -> None:
+        super().__init__(endpoint)
         self.up = up
         self.down = down
-        self.endpoint = endpoint
 
     def receive(self, data: bytes, now: float) -> None:
         """Pass a datagram on to the vehicle."""
         if all(map(self.up, messages_in(data))):
-            self.endpoint.receive(data, now)
-
-    def tick(self, now: float) -> None:
-        """Pass the time on."""
-        self.endpoint.tick(now)
-
-    def next_deadline(self) -> float | None:
-        """Return the vehicle's deadline."""
-        return self.endpoint.next_deadline()
+            super().receive(data, now)
 
     def data_to_send(self) -> list[bytes]:
         """Return what arrives of the vehicle's frames."""
-        return [data for data in self.endpoint.data_to_send() if all(map(self.down, messages_in(data)))]
+        return [data for data in super().data_to_send() if all(map(self.down, messages_in(data)))]
 
 
 class Silence(Tap):
