@@ -123,7 +123,7 @@ class Replaced:
 
     Attributes:
         params: the parameter before each change.
-        until: when such an answer can arrive no more.
+        until: when such an answer can arrive no more, but to a read that is sent then.
     """
 
     params: list[Param]
@@ -236,8 +236,8 @@ class Session:
         table.store(message, moment, is_exact=is_sent)
         if name in table.params and not is_overtaken:
             self._sequences[name] = sequence
-        if known is not None and may_read and not is_answer:
-            before = replaced.params if replaced is not None and is_late else []
+        if known is not None and may_read and message.param_index == NO_INDEX:
+            before = replaced.params if replaced is not None and now <= replaced.until + LATE_TIME else []
             params = [*before, known][-REPLACED_MAX:] if is_other else before
             self.replaced[name] = Replaced(params, now + LATE_TIME)
         return None

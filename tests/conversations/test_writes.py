@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Awaitable, Callable, Iterable
+from itertools import pairwise
 from typing import Any
 
 import anyio
@@ -264,6 +265,19 @@ async def test_a_busy_program_knows_a_late_answer_by_when_it_was_requested() -> 
             endpoint.down = lambda message: True
         await anyio.sleep(1.0)
         assert [each.new and each.new.value for each in conversation.changes][-1:] == [7.0]
+
+
+async def test_a_value_that_is_read_again_by_name_undoes_no_later_change() -> None:
+    """Without an index, the answer looks like an acknowledgement."""
+    async with talking(Air([ArduPilotVehicle()])) as (conversation, session):
+        await read(session, "ATC_ANG_RLL_P")
+        for step in range(0, 100, 4):
+            for value, pause in ((0, 0.1), (1, 0.1), (0, 0.2 + step / 500), (2, 1.0)):
+                raw = struct.pack("<f", step + value)
+                session.channel.send(ParamSet(1, 1, "ATC_ANG_RLL_P", raw, ParamType.REAL32))
+                await anyio.sleep(pause)
+        values = [float(each.new.value) for each in conversation.changes if each.new]
+        assert not any(later == value - 2 for value, later in pairwise(values))
 
 
 @pytest.mark.parametrize(("vehicle", "reorder"), [(PX4Vehicle(), 0.5), (ArduPilotVehicle(), 0.0)])
