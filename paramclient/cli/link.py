@@ -11,7 +11,7 @@ import anyio
 
 from paramclient.cli.json_output import JsonObject, taken
 from paramclient.cli.options import Seconds, TrafficOptions
-from paramclient.cli.output import milliseconds, print_json, print_line, print_table, show
+from paramclient.cli.output import milliseconds, print_json, print_line, print_table, say, show
 from paramclient.cli.session import Deadline, open_client, received_in_words
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
@@ -69,7 +69,10 @@ async def link(
                 if is_live:
                     sys.stdout.write("\x1b[H\x1b[J")  # erases it, for the next table in the same place
                     _print(found)
-        finally:  # also after Ctrl-C
+        except anyio.get_cancelled_exc_class():
+            say(f"interrupted. {received_in_words(client)}")
+            raise
+        finally:
             if found and found["frames"] and not is_live:
                 (print_json if options.json else _print)(found)
         tasks.cancel_scope.cancel()
@@ -109,6 +112,7 @@ def _json(client: ParamClient, report: TrafficReport) -> JsonObject:
 
 
 def _component_json(client: ParamClient, now: float, each: ComponentTraffic) -> JsonObject:
+    totals, rates = each.totals, each.rates
     beat, component = each.heartbeat, client.components.get((each.system, each.component))
     return {
         **taken(each, "system", "component"),
@@ -118,17 +122,13 @@ def _component_json(client: ParamClient, now: float, each: ComponentTraffic) -> 
         "state": beat and enum_word("MAV_STATE", beat.system_status),
         "heartbeat_age_s": None if each.heartbeat_at is None else rounded(now - each.heartbeat_at),
         "age_s": rounded(now - each.received_at),
-        **{name: each.totals[name] for name in ("frames", "bytes", "lost", "repeated", "late", "signed")},
-        **{f"{name}_per_s": round(each.rates[name], 2) for name in ("frames", "bytes")},
+        **{name: totals[name] for name in ("frames", "bytes", "lost", "repeated", "late", "signed")},
+        **{f"{name}_per_s": round(rates[name], 2) for name in ("frames", "bytes")},
         "loss": rounded(each.loss),
         "round_trip_s": component and rounded(component.round_trip),
         "messages": {
-            message_name(each_id): {
-                "id": each_id,
-                "count": each.totals[each_id],
-                "per_s": round(each.rates[each_id], 2),
-            }
-            for each_id in each.messages
+            message_name(number): {"id": number, "count": totals[number], "per_s": round(rates[number], 2)}
+            for number in each.messages
         },
         "radio": each.radio,
     }
@@ -139,18 +139,17 @@ def _print(found: JsonObject) -> None:
     for each in found["components"]:
         address, radio = f"{each['system']}/{each['component']}", each["radio"]
         trip, age, loss = each["round_trip_s"], each["heartbeat_age_s"], each["loss"]
-        rows.append(
-            (
-                address,
-                each["kind"] or ("radio" if radio else ""),
-                each["mavlink"],
-                round(each["frames_per_s"], 1),
-                round(each["bytes_per_s"]),
-                None if loss is None else f"{loss:.1%}",
-                None if trip is None else milliseconds(trip),
-                None if age is None else f"{age:.1f} s",
-            )
+        row = (
+            address,
+            each["kind"] or ("radio" if radio else ""),
+            each["mavlink"],
+            round(each["frames_per_s"], 1),
+            round(each["bytes_per_s"]),
+            None if loss is None else f"{loss:.1%}",
+            None if trip is None else milliseconds(trip),
+            None if age is None else f"{age:.1f} s",
         )
+        rows.append(row)
         kinds = [f"{name} {one['per_s']:.1f}/s" for name, one in each["messages"].items() if one["per_s"]]
         state = f" {each['state']}" if each["state"] else ""
         lines.append(f"{address}{state}: {first_of(kinds, MESSAGES_SHOWN_MAX) or 'silent'}")

@@ -110,10 +110,8 @@ def test_header_comments_and_footer_round_trip(form: FileFormat) -> None:
     assert once.sets[0]["A"].comment == "first"
     assert once.sets[0]["B"].comment == marked.comment
     assert once.sets[0]["C"].comment == ""
-    assert [line for line in once.header if "n" in line and "-Id" not in line][-2:] == [
-        "on top",
-        "  indented",
-    ]
+    lines = [line for line in once.header if "n" in line and "-Id" not in line]
+    assert lines[-2:] == ["on top", "  indented"]
     assert once.footer == ("the", "end")
     assert dumps(loads(dumps(once))) == dumps(once)
 
@@ -554,9 +552,8 @@ def test_a_document_of_an_earlier_version_reads_and_is_written_unchanged() -> No
     ],
 )
 def test_an_invalid_field_is_rejected(fields: str, problem: str) -> None:
-    error = failed(
-        f'{{"paramclient": 1, "sets": [{{"params": {{"OK": {{"value": 1}}, "A": {{{fields}}}}}}}]}}'
-    )
+    text = '{"paramclient": 1, "sets": [{"params": {"OK": {"value": 1}, "A": {?}}}]}'
+    error = failed(text.replace("?", fields))
     assert problem in str(error)
     assert error.source == "quad.x"
 
