@@ -236,9 +236,9 @@ class Session:
         table.store(message, moment, is_exact=is_sent)
         if name in table.params and not is_overtaken:
             self._sequences[name] = sequence
-        if known is not None and may_read and message.param_index == NO_INDEX:
+        if name in table.params and may_read and message.param_index == NO_INDEX:
             before = replaced.params if replaced is not None and now <= replaced.until + LATE_TIME else []
-            params = [*before, known][-REPLACED_MAX:] if is_other else before
+            params = [*before, known][-REPLACED_MAX:] if known is not None and is_other else before
             self.replaced[name] = Replaced(params, now + LATE_TIME)
         return None
 

@@ -270,7 +270,9 @@ async def test_a_busy_program_knows_a_late_answer_by_when_it_was_requested() -> 
 async def test_a_value_that_is_read_again_by_name_undoes_no_later_change() -> None:
     """Without an index, the answer looks like an acknowledgement."""
     async with talking(Air([ArduPilotVehicle()])) as (conversation, session):
-        await read(session, "ATC_ANG_RLL_P")
+        answer = ParamValue("ATC_ANG_RLL_P", bytes(4), ParamType.REAL32, 900, 3)
+        conversation.hear(answer._replace(raw=struct.pack("<f", 4.0), param_index=65535), answer)
+        assert session.table.params["ATC_ANG_RLL_P"].value == 4.0
         for step in range(0, 100, 4):
             for value, pause in ((0, 0.1), (1, 0.1), (0, 0.2 + step / 500), (2, 1.0)):
                 raw = struct.pack("<f", step + value)
