@@ -106,8 +106,7 @@ def answers_of(request: Packet, content: bytes) -> Iterator[Packet]:
         yield reply(request, content[offset : offset + size], offset=offset, step=step)
         if request.opcode != Opcode.BURST_READ_FILE:
             return
-    end = max(request.offset, len(content))
-    yield reply(request, error=FileErrorCode.EOF, offset=end, step=len(offsets) + 1)
+    yield reply(request, error=FileErrorCode.EOF, offset=len(content), step=len(offsets) + 1)
 
 
 @dataclass(slots=True)

@@ -51,8 +51,6 @@ SET_TIMEOUT: Final = 2.9
 OVERTAKING_BEATS: Final = 2
 """Heartbeats since a set that show, during a fetch, that its acknowledgement does not wait behind the list in
 the radio's queue: an error would be wrong then. The first of them may be older than the set."""
-ASKED_AT_ONCE: Final = 4
-"""Reads by stations that the vehicle is asked for at once."""
 TAKE_OVER_TIME: Final = 10.0
 """Seconds after which a list that was asked before the vehicle was heard is not expected any more."""
 REMEMBERED_TIME: Final = 30.0
@@ -148,9 +146,9 @@ def listed(session: Session) -> list[ReportedValue]:
 
 
 def whole_list(session: Session) -> list[ReportedValue] | None:
-    """Return the answers to a request for the list; None if not all values are known to be the vehicle's."""
-    values, table, digest = listed(session), session.table, digest_of(session)
-    if not values or not table.is_complete or len(values) < len(table.names):
+    """Return the answers to a request for the list of a table in sync; None while it cannot be decoded."""
+    values, digest = listed(session), digest_of(session)
+    if not values:
         return None
     return values if digest is None else [digest, *values]
 
@@ -204,7 +202,6 @@ class KeptTable(Stream[Change]):
         self._listing: dict[GroundStation, set[int]] = {}  # for a list, and the indices that each has
         self._listing_count: int | None = None
         self._loaded: anyio.Event | None = None  # while a fetch runs
-        self._asking = anyio.CapacityLimiter(ASKED_AT_ONCE)
         component.subscribers.add(self)
 
     # the state
@@ -253,7 +250,7 @@ class KeptTable(Stream[Change]):
     def push(self, item: Change) -> None:
         """Take a change, and announce it unless it is a first value."""
         self.changes += 1
-        if item.new is not None and item.kind != "first" and not self.is_lost:
+        if item.new is not None and item.kind != "first":
             self._announce(self, value_of(self.session, item.new))
 
     # lists
@@ -400,7 +397,7 @@ class KeptTable(Stream[Change]):
                 await anyio.sleep(PROGRESS_INTERVAL)
         if known := self.known(which):
             return known
-        async with turns, self._asking:
+        async with turns:
             value = await read(self.session, which)
         return value._replace(param_id=which) if isinstance(which, str) else value
 

@@ -44,7 +44,7 @@ REQUESTS_MAX: Final = 200
 """Requests of one station that wait for a vehicle or a fetch, at most; further ones are dropped, as on a full
 link."""
 READS_AT_ONCE: Final = 3
-"""Reads of one station that vehicles are asked for at once: fewer than of all, so that others have a turn."""
+"""Reads of one station that vehicles are asked for at once: fewer than an ArduPilot queues (20)."""
 SETS_AT_ONCE: Final = 20
 """Sets likewise: bursts of 20 to a PX4 were all acknowledged (measured)."""
 SOURCES_MAX: Final = 64
@@ -184,7 +184,6 @@ class GroundStation:
 
     def stream(self, key: Hashable, source: Source, messages: Iterator[Message]) -> None:
         """Send messages one by one as the station takes them, in place of an earlier stream of this key."""
-        self._streams.pop(key, None)
         if len(self._streams) < STREAMS_PER_STATION_MAX:
             self._streams[key] = (source, messages)
             self._something_to_send.set()
