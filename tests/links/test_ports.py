@@ -10,6 +10,7 @@ import serialx
 from paramclient.links import SerialPort, create_link, list_ports
 
 BY_ID = "/dev/serial/by-id/usb-Hex_ProfiCNC_CubeOrange_2E0045-if00"
+CUBE = {"manufacturer": "Hex/ProfiCNC", "product": "CubeOrange", "serial_number": "2E0045"}
 
 
 def info(device: str, **known: Any) -> serialx.SerialPortInfo:
@@ -25,16 +26,7 @@ def a_few() -> list[serialx.SerialPortInfo]:
         info("/dev/ttyS0"),
         info("/dev/ttyUSB10", vid=0x0403, pid=0x6001, manufacturer="FTDI", product="FT232R USB UART"),
         info("/dev/ttyUSB9", vid=0x10C4, pid=0xEA60, product="CP2102\x1b[31m", serial_number="0001"),
-        info(
-            BY_ID,
-            resolved_device="/dev/ttyACM1",
-            vid=0x2DAE,
-            pid=0x1016,
-            manufacturer="Hex/ProfiCNC",
-            product="CubeOrange",
-            serial_number="2E0045",
-            interface_num=0,
-        ),
+        info(BY_ID, resolved_device="/dev/ttyACM1", vid=0x2DAE, pid=0x1016, interface_num=0, **CUBE),
     ]
 
 
@@ -42,9 +34,7 @@ def test_autopilots_are_first_then_usb_devices(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(serialx, "list_serial_ports", a_few)
     found = list_ports()
     assert [port.device for port in found] == ["/dev/ttyACM1", "/dev/ttyUSB9", "/dev/ttyUSB10", "/dev/ttyS0"]
-    assert found[0] == SerialPort(
-        "/dev/ttyACM1", BY_ID, 0x2DAE, 0x1016, "Hex/ProfiCNC", "CubeOrange", "2E0045", 0
-    )
+    assert found[0] == SerialPort("/dev/ttyACM1", BY_ID, 0x2DAE, 0x1016, *CUBE.values(), 0)
     assert [port.autopilot for port in found] == ["CubePilot", None, None, None]
     assert found[-1] == SerialPort("/dev/ttyS0")
     assert [port.link for port in found[:2]] == [f"serial:{BY_ID}:57600", "serial:/dev/ttyUSB9:57600"]

@@ -12,6 +12,7 @@ import sys
 import tracemalloc
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,7 +22,7 @@ import anyio
 import fastcrc
 import pytest
 
-from paramclient import ParamType
+from paramclient import Param, ParamType
 from paramclient.client import taps
 from paramclient.client.signing import Signing
 from paramclient.errors import UsageError
@@ -225,6 +226,9 @@ async def test_rule_2_an_unknown_name_is_asked_of_the_vehicle_once() -> None:
         await station.ask(ParamRequestRead(1, 1, "NONE", -1), ParamRequestRead(1, 1, "", 999))
         assert len(station.of(ParamError)) == 2
         assert not requested(vehicle)
+        await anyio.sleep(kept_table.REMEMBERED_TIME)
+        await station.ask(ParamRequestRead(1, 1, "NONE", -1))
+        assert requested(vehicle)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -292,6 +296,8 @@ async def test_rule_2_the_parameter_file_in_the_requested_pieces(size: int, quer
         rows = [each._replace(default=None) if each.default == each.bits else each for each in pack.entries]
         wanted = encode(rows, total=pack.total, with_defaults=pack.with_defaults, read_size=size)
         assert content == wanted
+        await station.ask_file(Opcode.OPEN_FILE_RO, data=path.encode(), session=4)
+        await station.ask_file(Opcode.TERMINATE_SESSION, session=4)
         [part] = await station.ask_file(Opcode.READ_FILE, offset=size, size=size, session=3)
         assert part.data == content[size : 2 * size]
         close, session = (Opcode.RESET_SESSIONS, 0) if query else (Opcode.TERMINATE_SESSION, 3)
@@ -312,17 +318,19 @@ async def test_rule_2_a_repeated_opening_has_the_same_answer_when_the_table_is_i
 
 async def test_rule_2_the_file_of_a_px4_is_padded_for_pieces_of_239_bytes() -> None:
     """Whatever is requested: it sends no others."""
-    async with gateway_over(PX4Vehicle(ftp=True)) as served:
+    async with gateway_over(vehicle := Tap(PX4Vehicle(ftp=True))) as served:
         await (await served.clients[0].component()).wait_until_identified(5.0)
         await served.synced()
         station = served.partner()
+        vehicle.received.clear()
         await station.ask_file(Opcode.OPEN_FILE_RO, data=b"@PARAM/param.pck")
         content = content_of(await station.ask_file(Opcode.BURST_READ_FILE, size=80))
         rows = decode(content).entries
         assert content == encode(rows, total=903, read_size=239) != encode(rows, total=903, read_size=80)
+        assert not vehicle.messages(FileTransfer)
 
 
-@pytest.mark.parametrize("query", ["?colour=1", "?start=x", "?withdefaults=2"])
+@pytest.mark.parametrize("query", ["?colour=1", "?start=x", "?start=9999", "?withdefaults=2"])
 async def test_rule_2_a_query_that_the_table_does_not_answer_is_passed(query: str) -> None:
     async with in_sync(ArduPilotVehicle()) as (_, vehicle, station):
         data = f"@PARAM/param.pck{query}".encode()
@@ -337,6 +345,13 @@ def test_rule_2_a_file_with_defaults_that_are_unknown_is_one_without() -> None:
     assert unknown.content(full, 80) == unknown.content(plain, 80) == known.content(plain, 80)
     assert known.content(full, 80)[:2] == b"\x1c\x67"
     assert unknown.content(full, 80)[:2] == b"\x1b\x67"
+
+
+def test_rule_2_a_file_has_no_integers_that_a_list_may_have_rounded() -> None:
+    table = Mock(names={0: "A"}, params={"A": Param("A", 1 << 25, ParamType.INT32, 0, 1 << 25)}, hash=None)
+    assert kept_file.rows_of(Mock(table=table)) is None
+    table.hash = 1  # proven
+    assert kept_file.rows_of(Mock(table=table)) is not None
 
 
 @pytest.mark.parametrize("query", [b"", b"?withdefaults=1"])
@@ -533,6 +548,19 @@ async def test_rule_3_a_lost_vehicle_is_silent() -> None:
         assert await listed(station) == 26
 
 
+async def test_rule_3_a_component_without_heartbeats_is_lost_after_a_minute() -> None:
+    ask = messages.ParamExtRequestList(1, 100)
+    value = messages.ParamExtValue("A", bytes(128), ParamType.UINT8, 1, 0)
+    vehicle = Puppet(lambda message: [value] * (message == ask), heartbeat=None, component=100)
+    async with gateway_over(vehicle) as served:
+        vehicle.say(value)
+        station = served.partner()
+        for seconds, answers in ((0.0, 1), (50.0, 1), (61.0, 0)):
+            await anyio.sleep(seconds)
+            await station.ask(messages.ParamExtRequestRead(1, 100, "A", -1))
+            assert len(station.of(messages.ParamExtValue)) == answers, seconds
+
+
 async def test_rule_3_a_vehicle_that_is_lost_during_the_fetch_is_served_when_it_is_back() -> None:
     vehicle = Tap(Air.symmetric([PX4Vehicle()], rate=20_000.0))
     async with gateway_over(vehicle) as served:
@@ -698,6 +726,7 @@ async def test_rule_6_frames_are_packed() -> None:
 
 async def test_rule_6_queues_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stations, "STATION_QUEUE_MAX", 10)
+    monkeypatch.setattr(stations, "STREAMS_PER_STATION_MAX", 5)
     async with gateway_over(small_px4()) as served:
         station = served.partner()
         await station.ask(GCS)
@@ -706,6 +735,8 @@ async def test_rule_6_queues_are_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
         [there] = served.gateway.stations
         assert there.dropped > 10
         station.clear()
+        for stream in range(20):
+            there.stream(stream, (1, 1), iter([GCS]))
         served.link.is_stuck = False
         await anyio.sleep(0.5)
         assert len(station.frames) <= 20
@@ -864,11 +895,13 @@ async def test_rule_10_a_list_of_all_components() -> None:
 async def test_rule_10_what_is_asked_of_all_components() -> None:
     """A read is answered by those that have the name, and a set is one of the autopilot."""
     gimbal = generic(component=5, table={"TILT": 1.0})
-    async with in_sync(Air([gimbal, small_px4()])) as (served, _, station):
+    async with in_sync(Air([gimbal, small_px4()])) as (served, vehicle, station):
         await (await served.clients[0].component(1, 5)).fetch_all()
+        vehicle.received.clear()
         write = ParamSet(1, 0, "PARAM_01", struct.pack("<i", 9), ParamType.INT32)
         await station.ask(ParamRequestRead(1, 0, "TILT", -1), write, seconds=1.0)
         assert by_name(station) == {"TILT": struct.pack("<f", 1), "PARAM_01": struct.pack("<i", 9)}
+        assert requested(vehicle) == [replace(write, target_component=1)]
 
 
 async def test_rule_10_two_vehicles_with_one_id(caplog: pytest.LogCaptureFixture) -> None:
@@ -882,6 +915,11 @@ async def test_rule_10_two_vehicles_with_one_id(caplog: pytest.LogCaptureFixture
         for each in vehicles:
             assert [frame.system for _, frame, message in each.received if message == LIST][-1] == 255
         assert len(station.of(ParamValue)) == 52
+        vehicles[1].is_mute = True
+        await anyio.sleep(6.0)
+        vehicles[0].received.clear()
+        assert await listed(station) == 26
+        assert not requested(vehicles[0])
 
 
 # 11: loops
@@ -1001,9 +1039,10 @@ def test_rule_13_names_of_endpoints(tmp_path: Path) -> None:
     key.chmod(0o600)
     assert parse_endpoint("tcpin:5760").name == "tcpin:127.0.0.1:5760"
     assert parse_endpoint("udpin:0.0.0.0:14551?readonly&trusted").is_trusted
-    signed = parse_endpoint(f"udpout:127.0.0.1:14550?sign={key}")
+    signed = parse_endpoint(f"udpout:127.0.0.1:14550?sign={key}&trusted")
     assert signed.name == "udpout:127.0.0.1:14550"
     assert signed.signer is not None
+    assert not signed.is_trusted  # its frames keep their signatures
     with pytest.raises(UsageError, match="no endpoint"):
         parse_endpoint("sim:px4?readonly")
     for option in ("writeonly", "readonly=1", "sign"):
@@ -1210,7 +1249,7 @@ async def test_a_station_that_never_reads(monkeypatch: pytest.MonkeyPatch) -> No
 async def test_memory_stays_flat(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kept_table, "UNKNOWN_NAMES_MAX", 50)
     sizes = []
-    async with gateway_over(small_px4()) as served:
+    async with gateway_over(small_px4(param_error=True)) as served:
         await served.synced()
         stations = [served.partner(system=number) for number in range(200, 205)]
         tracemalloc.start()
