@@ -260,7 +260,6 @@ class GroundStation:
         system, component = source
         data = encode(message, system=system, component=component, sequence=number, version=self.version)
         if self.endpoint.signer is not None:
-            self.endpoint.signer.advance(anyio.current_time())
             data = sign_frame(data, self.endpoint.signer)
         self.answered += is_answer
         self.saved += len(data) * is_answer
@@ -286,7 +285,7 @@ class MavlinkEndpoint:
     Attributes:
         link, name, is_readonly, is_trusted: as given; with a key, all its stations sign.
         may_sign: whether what its stations ask may be sent with the gateway's signature.
-        signer: signs the answers; None without a key.
+        signer: signs the answers; None without a key. Its time follows that of the stations' frames.
         stations: the connected stations.
         sending: called with each frame and each datagram that is about to be sent to a station.
     """

@@ -34,7 +34,7 @@ def test_autopilots_are_first_then_usb_devices(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(serialx, "list_serial_ports", a_few)
     found = list_ports()
     assert [port.device for port in found] == ["/dev/ttyACM1", "/dev/ttyUSB9", "/dev/ttyUSB10", "/dev/ttyS0"]
-    assert found[0] == SerialPort("/dev/ttyACM1", BY_ID, 0x2DAE, 0x1016, *CUBE.values(), 0)
+    assert found[0] == SerialPort("/dev/ttyACM1", BY_ID, 0x2DAE, 0x1016, interface=0, **CUBE)
     assert [port.autopilot for port in found] == ["CubePilot", None, None, None]
     assert found[-1] == SerialPort("/dev/ttyS0")
     assert [port.link for port in found[:2]] == [f"serial:{BY_ID}:57600", "serial:/dev/ttyUSB9:57600"]

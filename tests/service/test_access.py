@@ -224,7 +224,6 @@ REFUSED: list[tuple[str, str, dict[str, Any]]] = [
     ("PUT", "params/PARAM_04", {}),
     ("PUT", "params/PARAM_04", {"value": 1, "settel_s": 1}),
     ("PUT", "params/PARAM_04", {"value": True}),
-    ("PUT", "params/PARAM_04", {"value": None}),
     ("PUT", "params/PARAM_04", {"value": 1, "timeout_s": -1}),
     ("POST", "apply", {}),
     ("POST", "apply", {"values": {"PARAM_04": 1}, "at": 1}),

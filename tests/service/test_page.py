@@ -72,6 +72,10 @@ class Sight:
         self.dialog.get_by_role("button", name="Send").click()
         expect(self.dialog.get_by_role("button", name="Done")).to_be_visible()
 
+    def sign_in(self, token: str) -> None:
+        self.dialog.get_by_label("Token").fill(token)
+        self.dialog.get_by_role("button", name="Sign in").click()
+
     def line(self, name: str) -> Locator:
         return self.dialog.get_by_role("row").filter(has=self.page.get_by_role("rowheader", name=name))
 
@@ -336,12 +340,9 @@ def test_without_a_token_one_signs_in(browser: Browser, visit: Callable[..., Sig
         for part in ("#main", "#rail", "#vehicle-choice"):
             expect(sight.page.locator(part)).to_be_hidden()
         expect(sight.page.locator("#role")).to_have_text("")
-        token = sight.dialog.get_by_label("Token")
-        token.fill("wrong")
-        sight.dialog.get_by_role("button", name="Sign in").click()
+        sight.sign_in("wrong")
         expect(sight.dialog).to_contain_text("not valid")
-        token.fill(reads)
-        sight.dialog.get_by_role("button", name="Sign in").click()
+        sight.sign_in(reads)
         expect(sight.row("MC_ROLL_P").or_(sight.page.locator("#rows .row").first).first).to_be_visible()
         expect(sight.page.locator("#role")).to_have_text("read-only")
         assert sight.page.locator("#actions").get_by_role("button", name="Snapshot").count() == 0
@@ -349,8 +350,7 @@ def test_without_a_token_one_signs_in(browser: Browser, visit: Callable[..., Sig
         sight.page.reload()
         expect(sight.page.locator("#rows .row").first).to_be_visible()  # the tab keeps it
         other = visit(bench.url, is_open=False)
-        other.dialog.get_by_label("Token").fill(writes)
-        other.dialog.get_by_role("button", name="Sign in").click()
+        other.sign_in(writes)
         expect(other.page.locator("#rows .row").first).to_be_visible()
         other.stage("MC_ROLL_P", "7.5")
         other.send()

@@ -100,7 +100,6 @@ SENT: list[Message] = [
     messages.ParamError(255, 190, "A", -1, 5),
     messages.ParamError(0, 0, "", 7, 1),
     messages.ParamExtRequestRead(1, 100, "CAM_MODE"),
-    messages.ParamExtRequestRead(1, 0, "", 7),
     messages.ParamExtRequestList(1, 100),
     messages.ParamExtValue(NAME, bytes(range(1, 129)), 11, 300, 299),
     messages.ParamExtSet(1, 100, "CAM_MODE", b"\x05".ljust(128, b"\0"), 5),
