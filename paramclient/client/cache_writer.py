@@ -53,6 +53,7 @@ class TableRecord:
         is_whole: whether the whole table is to be written, as it is.
         synced_at: when the table was last proven, in unix time, as the cache has it, or None.
         fetched_at: likewise in this session, by the clock of the event loop.
+        stored_at: of that, what the cache has.
     """
 
     generation: int = 0
@@ -60,10 +61,11 @@ class TableRecord:
     is_whole: bool = False
     synced_at: float | None = None
     fetched_at: float | None = None
+    stored_at: float | None = None
 
     @property
     def is_unwritten(self) -> bool:
-        return self.is_whole or bool(self.changes)
+        return self.is_whole or bool(self.changes) or self.fetched_at != self.stored_at
 
 
 class CacheWriter:
@@ -263,17 +265,17 @@ class CacheWriter:
             if not taken and (self._is_synced or not durable):
                 return  # which says nothing of the cache
             updates = [self._update(*each) for each in taken]
-            before = [(record, len(record.changes), record.is_whole) for _, _, record in taken]
+            before = [(each, len(each.changes), each.is_whole, each.fetched_at) for _, _, each in taken]
             for _, _, record in taken:
                 record.is_whole = False
             self._is_synced = False
             try:
                 await self._call(partial(self.cache.save, updates, durable=durable))
             except BaseException:
-                for record, _, was_whole in before:
+                for record, _, was_whole, _ in before:
                     record.is_whole |= was_whole
                 raise
-            for record, count, _ in before:
+            for record, count, _, record.stored_at in before:
                 del record.changes[:count]
             self._has_written = True
             self._is_synced = durable

@@ -82,6 +82,7 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(path: Path) -> None:
     volatile = {each.name for each in vehicle.entries if each.row.volatile and each.name in vehicle.params}
     first = await session(vehicle, path)
     assert first.source == "stream"
+    proven_at = table_in(path).synced_at
     tap = Tap(vehicle)
     async with ParamClient(Air.symmetric([tap], delay=0.1), cache=path) as client:
         await anext(client.events())
@@ -101,6 +102,7 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(path: Path) -> None:
     assert sorted(reads) == sorted([messages.HASH_CHECK, *volatile])
     assert not tap.messages(messages.ParamRequestList)
     assert kept(path) == bits(vehicle.params)
+    assert table_in(path).synced_at != proven_at
 
 
 async def test_changes_are_on_the_disk_within_the_flush_interval_whatever_a_commit_takes(path: Path) -> None:
