@@ -112,6 +112,8 @@ async def prove(session: Session) -> None:
                 if proof.take_over():
                     return
         except FileTransferError as error:
+            if error.code == FileErrorCode.FAIL_ERRNO and session.serves_checksum:
+                raise TableDiffers(OTHER) from None  # a range is beyond the end
             if error.code == FileErrorCode.UNKNOWN_COMMAND:
                 session.serves_checksum = False
             raise FileUnavailable(f"the checksum was refused: {error.reason}") from None
@@ -308,6 +310,7 @@ class _Proof:
         async def request(place: range) -> None:
             query = "" if place == whole else f"?start={place.start}&count={len(place)}"
             self._found[place] = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
+            session.serves_checksum = True
             answered.append(anyio.current_time())
 
         async with task_group() as tasks:
@@ -316,7 +319,6 @@ class _Proof:
                     await anyio.sleep(INTERVAL if number > AT_ONCE else INTERVAL_FIRST)
                 tasks.start_soon(request, place)
             sent_at = anyio.current_time()
-        session.serves_checksum = True
         self._is_scattered = max(answered) - min(answered) > SCATTERED
         elapsed = anyio.current_time() - sent_at
         self._round_trip = min(self._round_trip, elapsed)

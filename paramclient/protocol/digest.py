@@ -17,6 +17,7 @@ from paramclient.protocol.session import FileUnavailable, Session
 from paramclient.wire.messages import HASH_CHECK
 
 CHANGED_MEANWHILE: Final = "The parameters changed during the download: the table may be a mixture."
+NO_CHECKSUM: Final = "the vehicle computes no checksum of its table"
 UNPROVEN: Final = "The vehicle's hash could not be computed from the table; it was equal before and after."
 
 
@@ -41,7 +42,7 @@ class Answer:
 
 def may_confirm(session: Session) -> bool:
     """Return whether the vehicle has confirmed the table, or computes a checksum as far as known."""
-    return session.table.hash is not None or _may_prove(session)
+    return (session.identification.is_px4 and session.table.hash is not None) or _may_prove(session)
 
 
 async def ask(session: Session, *, refresh: bool = False) -> Answer:
@@ -61,7 +62,8 @@ async def ask(session: Session, *, refresh: bool = False) -> Answer:
         return Answer(is_current=True)
     digest = await _request(session)
     if refresh or not session.table.agrees_with(digest):
-        return Answer(digest=digest)
+        is_told = session.identification.is_ardupilot and session.table.is_complete and not refresh
+        return Answer(digest=digest, reason=NO_CHECKSUM * is_told)
     session.table.verify()
     return Answer(is_current=True, digest=digest)
 

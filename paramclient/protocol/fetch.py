@@ -12,7 +12,7 @@ import anyio
 from paramclient.errors import NoReply
 from paramclient.model.names import NamedChoice, first_of
 from paramclient.model.paramset import ParamMap
-from paramclient.model.values import Param
+from paramclient.model.values import Param, Trust
 from paramclient.protocol.checksum import is_moving
 from paramclient.protocol.digest import Answer, ask, settle
 from paramclient.protocol.file_download import download_file
@@ -34,6 +34,7 @@ NOT_READ: Final = "Values outside the vehicle's hash could not be read: {}."
 CHANGED: Final = "Changed since they were cached: {}."
 SHOWN_MAX: Final = 5
 """Names that a note has, so that it stays readable."""
+INCOMPLETE: Final = "it has not all parameters, or the vehicle has another number of them by now"
 UNCONFIRMED: Final = "The cached table was not confirmed: {}."
 LOST: Final = "The component was lost."
 REPLACED: Final = "Another vehicle has taken the address, and its parameters were fetched: {}."
@@ -199,6 +200,9 @@ class _Fetch:
             with self.session.channel.gate.until_closed(or_failed=True), anyio.move_on_after(IDENTITY_TIME):
                 await self.session.identification.heard()
             answer = await ask(self.session, refresh=refresh)
+        elif self.session.identification.is_ardupilot and not refresh:
+            cached = [each for each in self._before.values() if each.trust is Trust.CACHED]
+            answer = Answer(reason=INCOMPLETE * any(each.index is not None for each in cached))
         if answer.is_current:
             self._name_changes()
             if self.policy is Policy.AUTO:

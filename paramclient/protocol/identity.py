@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
@@ -84,6 +85,7 @@ class Identification:
         vehicles: counts the vehicles of which it is certain that they are not the one before. One that was
             not known before it was lost counts as another one.
         former: the vehicle before; without a hardware id if that was not known.
+        derived: called where the encoding, or whether it is certain, may have changed.
     """
 
     identity: Identity
@@ -99,6 +101,7 @@ class Identification:
     def __post_init__(self) -> None:
         self.encoding, self.encoding_reason = judge_encoding(self.chosen, None, None)
         self.former = self.identity
+        self.derived: Callable[[], None] = lambda: None
         self._has_no_heartbeat = False
         self._changed = anyio.Event()
 
@@ -256,6 +259,7 @@ class Identification:
 
     def _derive(self) -> None:
         self.encoding, self.encoding_reason = judge_encoding(self.chosen, self.capabilities, self.autopilot)
+        self.derived()
         self._changed.set()
         self._changed = anyio.Event()
 

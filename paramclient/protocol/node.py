@@ -93,6 +93,8 @@ class Node:
         self.generation = 0
         self._spawn = spawn
         self._identifying: Shared[None] = Shared(spawn, gate)
+        self.identification.derived = self._settle_encoding
+        self._settle_encoding()  # the user may have chosen it
 
     def receive(self, message: Message, now: float, version: int = 2, sequence: int = 0) -> None:
         """Take a message of the component: into the tables, and to the conversations that wait for it."""
@@ -122,19 +124,16 @@ class Node:
                 if self.identification.heartbeat(message):
                     self._doubt()
                     self._spawn(self.identify)
-                self._settle_encoding()
                 if presence.heartbeat(message, now):
                     self.rebooted(now)
             case messages.HighLatency2():
                 presence.high_latency()
                 self.identification.heartbeat(message)
-                self._settle_encoding()
             case messages.SystemTime(time_boot_ms=boot_ms):
                 self.boot_clock(SYSTEM_TIME, boot_ms, now)
             case messages.AutopilotVersion():
                 if self.identification.version(message):
                     self._replace()
-                self._settle_encoding()
                 self.emit("identified")
         self.channel.dispatch(message)
 
@@ -198,17 +197,14 @@ class Node:
             return
         was_settled = self.identification.is_settled
         await self.identified()
-        self._settle_encoding()
         if not was_settled and self.identification.capabilities is None:
             self.emit("identified")
         if not self.identification.is_encoding_certain:
             await anyio.sleep(HEARTBEAT_WAIT)
             self.identification.miss_heartbeat()
-            self._settle_encoding()
         if not self.channel.answered.is_set():  # requests may not reach it yet
             await self.channel.answered.wait()
             await self.identified()
-            self._settle_encoding()
         await anyio.sleep(CLOCK_DELAY)
         await self._request_clock()
 

@@ -75,8 +75,7 @@ def only_vehicle(
     Raises:
         AmbiguousVehicle: the address fits several vehicles.
     """
-    present = [each for each in nodes if not each.presence.is_lost]
-    fitting = [each for each in present if system in (None, each.system)]
+    fitting = [each for each in nodes if system in (None, each.system) and not each.presence.is_lost]
     vehicles = autopilots_of(fitting)
     if component is None:
         found = _autopilots(fitting)
@@ -84,11 +83,8 @@ def only_vehicle(
             found = [each for each in found if each.component == AUTOPILOT_COMPONENT] or found
     else:
         found = [each for each in fitting if each.component == component]
-        vehicles = (
-            found
-            if system is not None
-            else list({each.system: each for each in [*found, *vehicles]}.values())
-        )
+        by_system = {each.system: each for each in [*found, *vehicles]}
+        vehicles = [*by_system.values()] if system is None else found
     if len(vehicles) > 1 or len(found) > 1:
         raise _ambiguous(vehicles if len(vehicles) > 1 else found)
     if not found:
@@ -150,14 +146,9 @@ def hint_of_node(station: Station, node: Node, now: float) -> str:
     if others and not node.plain.table.moments:
         return f"{does}, but no values; values came from {first_of(others, LISTED_MAX)}, which may be meant."
     if node.channel.timing.round_trip is not None:
-        return (
-            f"{does} and answered other requests: it may not support this one or be busy, or "
-            "the link may lose packets."
-        )
-    return (
-        f"{does} and answers no request: requests do not reach it, or it ignores them. Check the link "
-        "towards the vehicle, and whether the vehicle requires signed messages."
-    )
+        return f"{does} and answered other requests: it may not support this one, or packets may be lost."
+    hint = "Check the link towards the vehicle, and whether the vehicle requires signed messages."
+    return f"{does} and answers no request: requests do not reach it, or it ignores them. {hint}"
 
 
 def _autopilots(nodes: Iterable[Node]) -> list[Node]:

@@ -172,7 +172,8 @@ class Watch:
         was_doubted = self._is_doubted
         before = self._before if was_doubted else dict(table.params)
         answer = await ask(session)
-        if answer.reason and not answer.is_other and not was_doubted:
+        may_fetch = was_doubted or answer.is_other or (self.interval is not None and not may_confirm(session))
+        if answer.reason and not may_fetch:
             return  # another station's file is open, for example
         if not answer.is_current:
             self._before, self._is_doubted = before, True

@@ -312,6 +312,8 @@ def test_loss_leaves_nothing_wrong(loss: float, changed: dict[str, float]) -> No
 CASES = {
     "unknown command": ("ftp", "refused"),
     "silent": ("stream", "MAVFTP did not answer"),
+    "denied": ("stream", "computes no checksum"),
+    "announced": ("ftp", "another number"),
     "count": ("ftp", "other parameters"),
     "many": ("ftp", "quicker than a search"),
     "renamed": ("ftp", "other parameters"),
@@ -322,9 +324,9 @@ CASES = {
 @pytest.mark.parametrize("kind", CASES)
 @virtual
 async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = ArduPilotVehicle(ftp=kind != "denied")
     cached = vehicle.params
-    if kind == "count":
+    if kind in ("count", "announced"):
         vehicle.load({"EK2_ENABLE": 1})
     elif kind == "many":
         vehicle.load(dict.fromkeys(list(cached)[300:700:20], 3))
@@ -347,6 +349,9 @@ async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None
         return False
 
     async with converse(Tap(vehicle, up=passes)) as conversation:
+        if kind == "announced":
+            await conversation.node()
+            conversation.hear(ParamValue("STAT_RUNTIME", bytes(4), ParamType.INT32, 1434, NO_INDEX))
         node = await with_cached_table(conversation, cached)
         began = anyio.current_time()
         result = await fetched(vehicle, node)
@@ -543,6 +548,12 @@ async def test_a_watch_finds_a_lost_announcement_for_one_request(is_cached: bool
             vehicle.load(dict.fromkeys(NAMES[300:700:20], 3))  # as a written param.pck: not announced
             await anyio.sleep(31.0)
             assert all(node.plain.table.params[name].value == 3 for name in NAMES[300:700:20])
+            for is_on in (1, 0):  # with parameters of its own
+                vehicle.load({"EK2_ENABLE": is_on})
+                await anyio.sleep(31.0)
+                assert node.plain.table.count == len(vehicle.listed)
+            node.identification.capabilities = 0  # it was restarted without MAVFTP
+            await anyio.sleep(62.0)
             assert not conversation.sent_of(ParamRequestList)
             tasks.cancel_scope.cancel()
 

@@ -382,3 +382,11 @@ async def test_a_component_with_the_id_0_is_a_component() -> None:
         assert (await component.fetch_all()).complete
         with pytest.raises((errors.NoReply, errors.AmbiguousVehicle)):
             await client.component(1, 7, timeout=3.0)
+
+
+@virtual_on_both
+async def test_the_chosen_encoding_counts_from_the_first_value_on() -> None:
+    vehicle = Partial(encoding=Encoding.C_CAST, heartbeat=None, component=240)
+    async with ParamClient(vehicle, cache=False, encoding=Encoding.C_CAST) as client:
+        await (await client.component(1, 240)).set("MODE", 9)
+        assert vehicle.values["MODE"] == encode_value(9, ParamType.INT32, Encoding.C_CAST)
