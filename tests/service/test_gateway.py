@@ -518,6 +518,13 @@ async def test_rule_3_no_value_is_served_while_its_encoding_is_in_doubt() -> Non
         assert found == {(float_120, 0), (float_120, 1)}
 
 
+async def test_rule_3_a_list_with_a_name_that_is_not_stored_is_the_vehicles() -> None:
+    model = partial(generic, table={"A": 1.0, "B,": 2.0})
+    async with in_sync(model()) as (_, _, station):
+        await station.ask(LIST)
+        assert station.of(ParamValue) == answers_of(model(), ParamValue, LIST)
+
+
 async def test_rule_3_cached_values_are_never_served(tmp_path: Path) -> None:
     cache = tmp_path / "cache.db"
     async with in_sync(small_px4(), cache=cache):
@@ -904,14 +911,16 @@ async def test_rule_10_what_is_asked_of_all_components() -> None:
         assert requested(vehicle) == [replace(write, target_component=1)]
 
 
-async def test_rule_10_two_vehicles_with_one_id(caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("is_one_link", [False, True])
+async def test_rule_10_two_vehicles_with_one_id(is_one_link: bool, caplog: pytest.LogCaptureFixture) -> None:
     vehicles = [Tap(small_px4()), Tap(small_px4())]
-    async with gateway_over(*vehicles) as served:
+    links = [PeersLink(dict(enumerate(vehicles)))] if is_one_link else vehicles
+    async with gateway_over(*links) as served:
         await served.synced()
         station = served.partner()
         with caplog.at_level(logging.WARNING):
             await station.ask(LIST, seconds=2.0)
-        assert "1/1 is on two links" in caplog.text
+        assert is_one_link or "1/1 is on two links" in caplog.text
         for each in vehicles:
             assert [frame.system for _, frame, message in each.received if message == LIST][-1] == 255
         assert len(station.of(ParamValue)) == 52
