@@ -10,7 +10,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from paramclient.model.comparison import ChangedSide, DifferenceStatus
-from paramclient.model.identity import autopilot_name, version_text
+from paramclient.model.identity import version_text
 from paramclient.model.notation import (
     Scalar,
     bits_text,
@@ -142,11 +142,10 @@ def compared_json(param: WrittenParam, metadata: Metadata | None = None) -> Json
 
 def vehicle_json(vehicle: Component) -> JsonObject:
     """Return a vehicle that is written to."""
-    identity = vehicle.identity
+    identity, heard = vehicle.identity, vehicle.node.identification
     return {
-        **taken(vehicle, "system", "component"),
-        "autopilot": autopilot_name(identity.autopilot),
-        "kind": kind_in_words(identity.autopilot, identity.vehicle_type),
+        **taken(vehicle, "system", "component", "autopilot"),
+        "kind": kind_in_words(heard.autopilot, heard.vehicle_type),
         "firmware": version_text(identity.firmware) if identity.firmware else None,
         "uid": identity.uid,
     }
@@ -157,7 +156,7 @@ def origin_json(params: ParamSet) -> JsonObject:
     identity = params.identity
     return {
         **taken(params, "source", "system", "component"),
-        "autopilot": None if identity is None else autopilot_name(identity.autopilot),
+        "autopilot": params.autopilot or None,
         "uid": None if identity is None else identity.uid,
         "at": time_or_none(params.at),
         "count": len(params),

@@ -25,7 +25,6 @@ from paramclient.files.formats import address, format_of_name
 from paramclient.links import LinkKind, parse_link
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import compare
-from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.paramset import ParamSet, default_of
 from paramclient.provision import sources
@@ -314,7 +313,7 @@ def described(params: ParamSet) -> str:
     """Return a set in words: `903 parameters of 1/1 px4 from link sim:px4, 2026-11-20T18:00:00.000Z`."""
     origin = [
         "" if params.component is None and params.system is None else f"of {address(params)}",
-        "" if params.identity is None else autopilot_name(params.identity.autopilot),
+        params.autopilot,
         f"from {params.source}" if params.source else "",
     ]
     at = "" if params.at is None else f", {local_time(params.at)}"

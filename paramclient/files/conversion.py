@@ -16,7 +16,7 @@ from paramclient.files import json_format, lists
 from paramclient.files.disk import LARGEST_FILE, read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, format_of_name
 from paramclient.files.reading import UTF16_MARKS, Reading
-from paramclient.model.identity import autopilot_name, check_ids, version_text
+from paramclient.model.identity import check_ids, version_text
 from paramclient.model.names import counted, first_of
 from paramclient.model.notation import time_text
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -267,7 +267,7 @@ def _as_file(content: ParamSet | Iterable[ParamSet], file_format: FileFormat) ->
 def _header_lines(params: ParamSet) -> Iterator[str]:
     """Generate a description of a set, for the header of a file."""
     identity = params.identity
-    kind = "" if identity is None else f", {autopilot_name(identity.autopilot)}"
+    kind = f", {params.autopilot}" if params.autopilot else ""
     yield f"{counted(len(params), 'parameter')} of {address(params)}{kind}"
     if identity is not None:
         commit = f", commit {identity.git_hash}" if identity.git_hash else ""

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import TypeVar
 
 from paramclient.errors import UsageError
-from paramclient.model.identity import Identity
+from paramclient.model.identity import Identity, autopilot_name
 from paramclient.model.names import ByName, NameChoice, counted
 from paramclient.model.values import (
     WIRE_SIZE,
@@ -163,6 +163,12 @@ class ParamSet(ByName[WrittenParam]):
         """
         chosen = NameChoice(patterns).choose(self.keys(), f" of {self.source}" if self.source else "")
         return replace(self, params={name: param for name, param in self.items() if name in chosen})
+
+    @property
+    def autopilot(self) -> str:
+        """The autopilot that these are of: "px4"; "" if that is unknown, or they are of another component."""
+        is_own = self.component in (None, 1)
+        return autopilot_name(self.identity.autopilot) if self.identity is not None and is_own else ""
 
     def __repr__(self) -> str:
         origin = f" from {self.source}" if self.source else ""

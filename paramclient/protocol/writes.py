@@ -38,6 +38,8 @@ SILENT_SETS_MAX: Final = 3
 """Sets without an acknowledgement, after which a read shows the value: some firmware acknowledges none."""
 SETS_MIN: Final = 5
 SETS_MAX: Final = 12
+SETS_TIME: Final = 5.0
+"""Seconds of sets in vain after which the fewest suffice."""
 SETS_LOST: Final = 1e-4
 """Probability that all sets are lost, at which a vehicle that keeps the old value has not applied them."""
 QUEUE_WAITS: Final = 3
@@ -261,8 +263,8 @@ class _Write:
                     return self._result(answer)
                 elif answer.same_value(self.before):
                     sets_max = min(max(self.channel.timing.attempts_for(SETS_LOST), SETS_MIN), SETS_MAX)
-                    if self.attempts >= sets_max:
-                        now = anyio.current_time()
+                    now = anyio.current_time()
+                    if self.attempts >= (SETS_MIN if now - self._began > SETS_TIME else sets_max):
                         answer = await self._wanted_behind(inbox, now) or await self._read(inbox)
                         if self._is_wanted(answer):
                             return self._result(answer)
