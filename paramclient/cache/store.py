@@ -165,7 +165,8 @@ class ParamCache:
             table = tables.find_table(tx, key, component, extended=extended)
             if table is None:
                 return None
-            self._known_lines.setdefault((table.owner, ""), history.last_line(tx, table.owner))
+            mark = (history.last_line(tx, table.owner), time.time())
+            self._known_lines.setdefault((table.owner, ""), mark)
             return tables.load_component(tx, table)
 
         return self._read(work)

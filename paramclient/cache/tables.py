@@ -198,10 +198,10 @@ _UPSERT: Final = """
 """The last value is the time after which stored times are from before the clock was set back."""
 
 
-KnownLines = dict[tuple[int, str], int]
+KnownLines = dict[tuple[int, str], tuple[int, float]]
 """The last line that a program has written, or has received too, by table and name; with no name, the last
-when it loaded the table. Another program may have written later ones of changes that this one, on a busy
-computer, receives late."""
+when it loaded the table, and when that was: what it had heard before may be in such a line. Another program
+may have written later ones of changes that this one, on a busy computer, receives late."""
 
 
 def ensure_table(
@@ -252,7 +252,7 @@ def save_table(tx: Transaction, update: TableUpdate, now: float, known: KnownLin
                 lines.append(Line(item.heard_at, item.name, item.by, old_at, old_value, item.stored))
             rows[item.name] = item
             is_rehashed = is_rehashed or item.hashed != (old and old.hashed)
-    known |= dict.fromkeys(((owner, line.name) for line in lines), add_lines(tx, owner, lines))
+    known |= dict.fromkeys(((owner, line.name) for line in lines), (add_lines(tx, owner, lines), 0.0))
     kept = TableState() if before is None else before.summary
     is_late = before is not None and update.at < before.summary.updated_at <= horizon
     state = _state_to_write(update, kept, agrees=agrees, is_late=is_late) if is_whole else None
@@ -325,15 +325,16 @@ def _unrecorded(
     """Return observations by parameter, in their order, without those that another program has stored with a
     later change, or that were received before a change that it has stored."""
     first = min((item.heard_at for item in items), default=math.inf)
-    recent, loaded = lines_since(tx, owner, first - SAME_CHANGE_MAX), known.get((owner, ""), 0)
+    recent, loaded = lines_since(tx, owner, first - SAME_CHANGE_MAX), known.get((owner, ""), (0, 0.0))
     kept: dict[str, list[StoredParam]] = {}
     for item in items:
-        row, last = rows.get(item.name), known.get((owner, item.name), loaded)
+        row, (newest, since) = rows.get(item.name), known.get((owner, item.name), loaded)
+        last = newest if item.heard_at > since else 0
         is_kept = True
         for number, line in recent.get(item.name, ()):
             is_near = number > last and line.at > item.heard_at - SAME_CHANGE_MAX
             if is_near and is_same_value(line.new, item.stored):
-                known[owner, item.name] = number
+                known[owner, item.name] = (number, 0.0)
                 kept[item.name] = []
                 is_kept = is_same_value(row and row.stored, item.stored)
                 break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import pytest
@@ -55,7 +56,9 @@ def test_a_program_that_reads_late_repeats_no_change(cache: ParamCache, open_cac
     observe(late, 0.5, 1, 2, 0, 1, 0, 2)
     observe(cache, 1.2, 2, 0)
     starting = [stored("PARAM_0", value, at=NOW + 2.95) for value in (1, 2, 0)]
-    open_cache().save(update(*starting, at=NOW + 6))
+    program = open_cache()
+    program.load(whole_table(1).identity.key, 1)  # later than it has heard these
+    program.save(update(*starting, at=NOW + 6))
     assert [line[2:4] for line in lines(cache)] == [(0, 1), (1, 2), (2, 0), (0, 1), (1, 0), (0, 2), (2, 0)]
     assert values(cache) == {"PARAM_0": 0}
 
@@ -63,10 +66,10 @@ def test_a_program_that_reads_late_repeats_no_change(cache: ParamCache, open_cac
 def test_programs_one_after_the_other_may_set_a_value_back(cache: ParamCache, open_cache: Open) -> None:
     table = whole_table(1)
     cache.save(table)
-    for step, value in enumerate((1, 0, 1)):
+    for value in (1, 0, 1):
         program = open_cache()
         program.load(table.identity.key, 1)
-        program.save(update(stored("PARAM_0", value, at=NOW + step / 2, by="us"), at=NOW + step / 2))
+        program.save(update(stored("PARAM_0", value, at=(now := time.time()), by="us"), at=now))
         assert values(cache) == {"PARAM_0": value}
     assert [line[2:4] for line in lines(cache)] == [(0, 1), (1, 0), (0, 1)]
 
