@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import struct
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import replace
 
 import anyio
@@ -22,7 +23,7 @@ from paramclient.protocol.node import Node
 from paramclient.protocol.param_pck import PackedParam, encode_entries
 from paramclient.protocol.watch import Watch
 from paramclient.protocol.writes import write
-from paramclient.sim import Air, ArduPilotVehicle
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint
 from paramclient.wire.messages import (
     NO_INDEX,
     FileTransfer,
@@ -33,7 +34,7 @@ from paramclient.wire.messages import (
     ParamValue,
     encode,
 )
-from tests.conversations.virtual import Conversation, Tap, converse, run, virtual, virtual_on_both
+from tests.conversations.virtual import Conversation, Tap, converse, run, virtual_on_both
 
 MOVED = ("INS_GYROFFS_X", "INS_GYR2OFFS_Z", "BARO1_GND_PRESS", "STAT_RUNTIME", "STAT_BOOTCNT")
 
@@ -47,6 +48,15 @@ async def with_cached_table(conversation: Conversation, cached: dict[str, Param]
     known |= {"moments": dict.fromkeys(cached, -1.0)} | options
     node.plain.table.load(cached.values(), **known)  # type: ignore[arg-type]  # a mapping of options
     return node
+
+
+@asynccontextmanager
+async def cached_on(
+    endpoint: Endpoint, cached: dict[str, Param], **options: object
+) -> AsyncIterator[tuple[Conversation, Node]]:
+    """Open a station, whose autopilot has a table as the cache loads it."""
+    async with converse(endpoint) as conversation:
+        yield conversation, await with_cached_table(conversation, cached, **options)
 
 
 def opcodes(conversation: Conversation) -> list[int]:
@@ -66,8 +76,7 @@ async def fetched(vehicle: ArduPilotVehicle, node: Node) -> FetchResult:
 @virtual_on_both
 async def test_an_unchanged_table_costs_one_request_and_opens_nothing() -> None:
     vehicle = ArduPilotVehicle()
-    async with converse(Air.symmetric([vehicle], delay=0.02)) as conversation:
-        node = await with_cached_table(conversation, vehicle.params)
+    async with cached_on(Air.symmetric([vehicle], delay=0.02), vehicle.params) as (conversation, node):
         began = anyio.current_time()
         result = await fetched(vehicle, node)
         assert anyio.current_time() - began < 0.05
@@ -79,13 +88,11 @@ async def test_an_unchanged_table_costs_one_request_and_opens_nothing() -> None:
 
 @pytest.mark.parametrize(("delay", "seconds"), [(0.004, 0.05), (0.05, 0.12)])
 @pytest.mark.parametrize("passed", [0, 30])
-@virtual
 async def test_seconds_that_were_counted_need_no_read(delay: float, seconds: float, passed: int) -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     vehicle.load({"STAT_RUNTIME": 600})
     cached = vehicle.params
-    async with converse(Air.symmetric([vehicle], delay=delay)) as conversation:
-        node = await with_cached_table(conversation, cached)
+    async with cached_on(Air.symmetric([vehicle], delay=delay), cached) as (conversation, node):
         vehicle.load({"STAT_RUNTIME": int(cached["STAT_RUNTIME"].value) + passed})
         sent, began = len(conversation.sent), anyio.current_time()
         result = await fetched(vehicle, node)
@@ -95,12 +102,10 @@ async def test_seconds_that_were_counted_need_no_read(delay: float, seconds: flo
         assert not conversation.sent_of(ParamRequestRead)
 
 
-@virtual
 async def test_pressure_that_a_rover_measures_all_the_time_needs_no_read() -> None:
     vehicle = ArduPilotVehicle(kind="rover", live_period=0.0)
     vehicle.load({"STAT_RUNTIME": 600})
-    async with converse(Air.symmetric([vehicle], delay=0.004)) as conversation:
-        node = await with_cached_table(conversation, vehicle.params)
+    async with cached_on(Air.symmetric([vehicle], delay=0.004), vehicle.params) as (conversation, node):
         for step, reads in ((0.5, 0), (1.25, 0), (-3.5, 0), (4000.0, 2)):
             vehicle.load(
                 {n: float(vehicle.param(n).value) + step for n in ("BARO1_GND_PRESS", "BARO2_GND_PRESS")}
@@ -115,7 +120,6 @@ async def test_pressure_that_a_rover_measures_all_the_time_needs_no_read() -> No
             assert reads or sum(map(len, conversation.sent[sent:])) < 350  # the answers are shorter
 
 
-@virtual
 async def test_a_value_that_moves_between_two_requests_starts_no_search() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     cached = vehicle.params
@@ -134,7 +138,6 @@ async def test_a_value_that_moves_between_two_requests_starts_no_search() -> Non
 
 
 @pytest.mark.parametrize(("after", "is_lost"), [(0, False), (1, False), (1, True)])
-@virtual
 async def test_pressure_that_moves_between_requests_costs_a_round_trip(after: int, is_lost: bool) -> None:
     vehicle = ArduPilotVehicle(kind="rover", live_period=0.0)
     pressures = ("BARO1_GND_PRESS", "BARO2_GND_PRESS")
@@ -155,7 +158,6 @@ async def test_pressure_that_moves_between_requests_costs_a_round_trip(after: in
         assert not is_lost or len(set(conversation.sent_of(FileTransfer))) <= 10
 
 
-@virtual
 async def test_values_that_move_are_read_by_their_checksum_and_learnt() -> None:
     vehicle = ArduPilotVehicle()
     async with converse(vehicle) as conversation:
@@ -167,7 +169,6 @@ async def test_values_that_move_are_read_by_their_checksum_and_learnt() -> None:
         assert node.plain.table.volatile >= {"STAT_RUNTIME"}
 
 
-@virtual
 async def test_an_announcement_before_the_cached_table_takes_no_index_away() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     async with converse(vehicle) as conversation:
@@ -180,7 +181,6 @@ async def test_an_announcement_before_the_cached_table_takes_no_index_away() -> 
         assert (result.source, result.missing) == ("cache", ())
 
 
-@virtual
 async def test_a_restart_is_recognized_by_the_boot_count() -> None:
     vehicle = ArduPilotVehicle()
     async with converse(vehicle) as conversation:
@@ -194,7 +194,6 @@ async def test_a_restart_is_recognized_by_the_boot_count() -> None:
         assert anyio.current_time() - began < 0.4
 
 
-@virtual
 async def test_two_values_changed_by_others_are_found_and_named() -> None:
     vehicle = ArduPilotVehicle()
     async with converse(vehicle) as conversation:
@@ -213,7 +212,6 @@ async def test_two_values_changed_by_others_are_found_and_named() -> None:
         assert changes["FORMAT_VERSION"] == "vehicle"
 
 
-@virtual
 async def test_changed_values_are_found_in_less_time_than_the_file_takes() -> None:
     """Also values without a short decimal form, of which the checksum does not show in which row they are."""
     elapsed = []
@@ -234,7 +232,6 @@ async def test_changed_values_are_found_in_less_time_than_the_file_takes() -> No
 
 @pytest.mark.parametrize("delay", [0.002, 0.05, 0.3])
 @pytest.mark.parametrize("is_simple", [True, False], ids=["simple", "odd"])
-@virtual
 async def test_a_search_ends_where_the_file_is_quicker(delay: float, is_simple: bool) -> None:
     floats = [each.name for each in ArduPilotVehicle().listed if each.type is ParamType.REAL32]
     for number in (5, 12, 20):
@@ -242,13 +239,11 @@ async def test_a_search_ends_where_the_file_is_quicker(delay: float, is_simple: 
         cached = vehicle.params
         names = [name for name in floats if name[:3] not in ("INS", "BAR")][number :: 400 // number][:number]
         vehicle.load({name: at + (2.5 if is_simple else 1 / 7) for at, name in enumerate(names)})
-        async with converse(Air.symmetric([vehicle], delay=delay)) as conversation:
-            node = await with_cached_table(conversation, cached)
+        async with cached_on(Air.symmetric([vehicle], delay=delay), cached) as (_, node):
             result = await fetched(vehicle, node)
             assert result.elapsed < 0.45 + 6 * 2 * delay  # the file takes 0.37 s and 3 round trips
 
 
-@virtual
 async def test_a_changed_count_costs_one_round_trip() -> None:
     elapsed = []
     for cached in ({}, ArduPilotVehicle().params):
@@ -262,11 +257,9 @@ async def test_a_changed_count_costs_one_round_trip() -> None:
     assert elapsed[1] - elapsed[0] < 0.12
 
 
-@virtual
 async def test_a_download_in_place_of_a_search_names_the_changes() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
-    async with converse(vehicle) as conversation:
-        node = await with_cached_table(conversation, vehicle.params)
+    async with cached_on(vehicle, vehicle.params) as (_, node):
         names = NAMES[300:700:20]
         vehicle.load({**dict.fromkeys(names, 3), "STAT_RUNTIME": 5})
         result = await fetch_all(node.plain)
@@ -275,7 +268,6 @@ async def test_a_download_in_place_of_a_search_names_the_changes() -> None:
         assert any("Changed since they were cached" in note for note in result.notes)
 
 
-@virtual
 async def test_a_value_that_is_another_at_each_read_ends_the_search() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
 
@@ -322,7 +314,6 @@ CASES = {
 
 
 @pytest.mark.parametrize("kind", CASES)
-@virtual
 async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None:
     vehicle = ArduPilotVehicle(ftp=kind != "denied")
     cached = vehicle.params
@@ -362,7 +353,6 @@ async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None
 
 
 @pytest.mark.parametrize("late", [0.0, 2.0])
-@virtual
 async def test_a_cached_table_is_proven_where_the_first_heartbeat_is_behind_the_version(late: float) -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     cached = vehicle.params
@@ -380,7 +370,6 @@ async def test_a_cached_table_is_proven_where_the_first_heartbeat_is_behind_the_
         assert (result.source, result.notes) == ("cache", ())
 
 
-@virtual
 async def test_nothing_is_checked_or_changed_by_a_refresh_or_without_a_complete_table() -> None:
     vehicle = ArduPilotVehicle()
     cached = vehicle.params
@@ -393,11 +382,9 @@ async def test_nothing_is_checked_or_changed_by_a_refresh_or_without_a_complete_
             assert Opcode.CALC_FILE_CRC32 not in opcodes(conversation)
 
 
-@virtual
 async def test_another_stations_open_file_costs_one_request() -> None:
     vehicle = ArduPilotVehicle()
-    async with converse(vehicle) as conversation:
-        node = await with_cached_table(conversation, vehicle.params)
+    async with cached_on(vehicle, vehicle.params) as (conversation, node):
         opening = Packet(7, 3, Opcode.OPEN_FILE_RO, b"@PARAM/param.pck")
         data = encode(FileTransfer(0, 1, 1, opening.pack()), system=252, component=190, sequence=0)
         vehicle.receive(data, anyio.current_time())
@@ -431,8 +418,7 @@ def test_no_difference_is_ever_taken_for_equal(changes: dict[str, int], kind: st
             cached[name] = replace(param, name="NO_SUCH_NAME")
         elif kind == "count":
             del cached[NAMES[-1]]
-        async with converse(vehicle) as conversation:
-            node = await with_cached_table(conversation, {each.name: each for each in cached.values()})
+        async with cached_on(vehicle, {each.name: each for each in cached.values()}) as (_, node):
             result = await fetched(vehicle, node)
             assert set(result.params) == set(vehicle.params)
 
@@ -466,7 +452,6 @@ def _swapped(cached: dict[str, Param], one: str, other: str) -> None:
         (_swapped, ["COMPASS_OFS_X", "COMPASS_OFS_Y"]),
     ],
 )
-@virtual
 async def test_a_value_makes_up_for_no_other_name_or_type(
     change: Callable[..., None], names: list[str]
 ) -> None:
@@ -474,17 +459,14 @@ async def test_a_value_makes_up_for_no_other_name_or_type(
     vehicle = ArduPilotVehicle(live_period=0.0)
     cached = vehicle.params
     change(cached, *names)
-    async with converse(vehicle) as conversation:
-        node = await with_cached_table(conversation, cached)
+    async with cached_on(vehicle, cached) as (_, node):
         result = await fetched(vehicle, node)
         assert set(result.params) == set(vehicle.params)
 
 
-@virtual
 async def test_a_change_in_the_middle_of_a_proof_is_not_proven() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
-    async with converse(Air.symmetric([vehicle], delay=0.05)) as conversation:
-        node = await with_cached_table(conversation, vehicle.params)
+    async with cached_on(Air.symmetric([vehicle], delay=0.05), vehicle.params) as (conversation, node):
         async with anyio.create_task_group() as tasks:
 
             async def change() -> None:
@@ -499,12 +481,10 @@ async def test_a_change_in_the_middle_of_a_proof_is_not_proven() -> None:
         assert len(result.params) == 1434
 
 
-@virtual
 async def test_an_acknowledgement_as_real32_changes_no_type() -> None:
     """ArduPilot acknowledges the set of a default as REAL32, whatever the type is."""
     vehicle = ArduPilotVehicle(live_period=0.0)
-    async with converse(vehicle) as conversation:
-        node = await with_cached_table(conversation, vehicle.params)
+    async with cached_on(vehicle, vehicle.params) as (_, node):
         await fetch_all(node.plain)
         for name in ("BARO_PROBE_EXT", "LOG_BITMASK", "RTL_ALT", "ARMING_CHECK"):
             before = vehicle.param(name)
@@ -514,13 +494,11 @@ async def test_an_acknowledgement_as_real32_changes_no_type() -> None:
         assert (result.source, result.changed) == ("cache", ())
 
 
-@virtual
 async def test_a_list_with_a_gap_in_its_names_is_no_question_for_a_checksum() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     cached = vehicle.params
     cached["WP_NAVALT_MIN_"] = replace(cached["WP_NAVALT_MIN"], name="WP_NAVALT_MIN_")
-    async with converse(vehicle) as conversation:
-        node = await with_cached_table(conversation, cached, count=1382)
+    async with cached_on(vehicle, cached, count=1382) as (_, node):
         node.plain.table.names[9] = node.plain.table.names[8]
         result = await fetched(vehicle, node)
         assert result.source == "ftp"
@@ -558,18 +536,15 @@ async def test_a_watch_finds_a_lost_announcement_for_one_request(is_cached: bool
             tasks.cancel_scope.cancel()
 
 
-@virtual
 async def test_a_listed_name_that_no_file_can_contain_is_no_proof_and_no_error() -> None:
     vehicle = ArduPilotVehicle()
-    async with converse(vehicle) as conversation:
-        node = await with_cached_table(conversation, vehicle.params)
+    async with cached_on(vehicle, vehicle.params) as (conversation, node):
         conversation.hear(ParamValue("RC MAP", bytes(4), ParamType.REAL32, node.plain.table.count or 0, 0))
         result = await fetch_all(node.plain)
         assert result.source == "ftp"
         assert "no file can contain" in result.notes[0]
 
 
-@virtual
 async def test_a_run_time_of_an_old_table_is_no_guess_that_hides_another_change() -> None:
     """The bits of one value that make the same difference as a run time of two days more."""
     vehicle = ArduPilotVehicle(live_period=0)

@@ -35,14 +35,7 @@ from paramclient.service.kept_file import FileQuery, Rows
 from paramclient.service.stations import MavlinkEndpoint, parse_endpoint
 from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, PX4Vehicle, Vehicle
 from paramclient.wire import frames, messages
-from paramclient.wire.messages import (
-    FileTransfer,
-    ParamError,
-    ParamRequestList,
-    ParamRequestRead,
-    ParamSet,
-    ParamValue,
-)
+from paramclient.wire.messages import FileTransfer, ParamRequestList, ParamRequestRead, ParamSet, ParamValue
 from paramclient.wire.signing import SigningKey
 from tests.conversations.virtual import Puppet
 from tests.ground_station import Station as GroundStation
@@ -141,7 +134,7 @@ async def test_rule_1_stations_with_equal_ids_send_equal_frames() -> None:
         await anyio.sleep(3.0)
         for each in stations:
             assert len(each.of(ParamValue)) == 26
-            assert len(each.of(ParamError)) == 1
+            assert len(each.of(messages.ParamError)) == 1
         assert len(vehicle.messages(messages.CommandLong)) == 1  # the others are equal, and arrive at once
 
 
@@ -220,11 +213,11 @@ async def test_rule_2_an_unknown_name_is_asked_of_the_vehicle_once() -> None:
         other = served.partner(system=9)
         other.send(ParamRequestRead(1, 1, "NONE", -1))
         await station.ask(ParamRequestRead(1, 1, "NONE", -1), seconds=3.0)
-        assert station.of(ParamError) == [ParamError(255, 190, "NONE", -1, 1)]
-        assert other.of(ParamError) == [ParamError(9, 190, "NONE", -1, 1)]
+        assert station.of(messages.ParamError) == [messages.ParamError(255, 190, "NONE", -1, 1)]
+        assert other.of(messages.ParamError) == [messages.ParamError(9, 190, "NONE", -1, 1)]
         vehicle.received.clear()
         await station.ask(ParamRequestRead(1, 1, "NONE", -1), ParamRequestRead(1, 1, "", 999))
-        assert len(station.of(ParamError)) == 2
+        assert len(station.of(messages.ParamError)) == 2
         assert not requested(vehicle)
         await anyio.sleep(kept_table.REMEMBERED_TIME)
         await station.ask(ParamRequestRead(1, 1, "NONE", -1))
@@ -660,16 +653,16 @@ async def test_rule_4_an_error_goes_to_the_asker_alone_within_3_seconds() -> Non
         other = served.partner(system=9)
         other.send(GCS)
         await station.ask(set_to("PARAM_01", 5, ParamType.INT16), seconds=0.1)
-        assert station.of(ParamError) == [ParamError(255, 190, "PARAM_01", -1, 7)]
+        assert station.of(messages.ParamError) == [messages.ParamError(255, 190, "PARAM_01", -1, 7)]
         await station.ask(ParamSet(1, 1, "PARAM_00", struct.pack("<f", math.nan), 9), seconds=0.1)
-        assert station.of(ParamError) == [ParamError(255, 190, "PARAM_00", -1, 2)]
+        assert station.of(messages.ParamError) == [messages.ParamError(255, 190, "PARAM_00", -1, 2)]
         for name in ("NONE", "param_01"):
             await station.ask(set_to(name, 5), seconds=3.0)
-            assert station.of(ParamError) == [ParamError(255, 190, name, -1, 1)]
+            assert station.of(messages.ParamError) == [messages.ParamError(255, 190, name, -1, 1)]
         vehicle.is_deaf = True
         await station.ask(set_to("PARAM_01", 5), seconds=3.0)
-        assert station.of(ParamError) == [ParamError(255, 190, "PARAM_01", -1, 4)]
-        assert not other.of(ParamError)
+        assert station.of(messages.ParamError) == [messages.ParamError(255, 190, "PARAM_01", -1, 4)]
+        assert not other.of(messages.ParamError)
 
 
 async def test_rule_4_an_ardupilot_takes_names_in_any_case_and_values_of_any_type() -> None:
@@ -688,7 +681,7 @@ async def test_rule_4_a_set_during_the_fetch_has_its_result_when_the_radio_bring
             station.send(set_to("VT_B_DEC_MSS", 3, ParamType.REAL32))
             await anyio.sleep(1.0)
         assert by_name(station)["VT_B_DEC_MSS"] == struct.pack("<f", 3)
-        assert not station.of(ParamError)
+        assert not station.of(messages.ParamError)
 
 
 async def test_rule_4_an_error_within_3_seconds_during_the_fetch_by_a_vehicle_that_fills_no_queue() -> None:
@@ -700,7 +693,7 @@ async def test_rule_4_an_error_within_3_seconds_during_the_fetch_by_a_vehicle_th
         await station.ask(LIST, seconds=2.0)
         vehicle.is_deaf = True
         await station.ask(set_to("ATC_ANG_RLL_P", 3, ParamType.REAL32), seconds=3.0)
-        assert station.of(ParamError) == [ParamError(255, 190, "ATC_ANG_RLL_P", -1, 4)]
+        assert station.of(messages.ParamError) == [messages.ParamError(255, 190, "ATC_ANG_RLL_P", -1, 4)]
 
 
 # 5: changes
@@ -1032,7 +1025,7 @@ async def test_rule_13_a_readonly_endpoint() -> None:
         station.send_bytes(mission)
         harmless = messages.CommandLong(1, 1, 512, 148.0)
         await station.ask(set_to("PARAM_01", 33), messages.CommandLong(1, 1, 400), harmless, LIST, GCS)
-        assert station.of(ParamError) == [ParamError(255, 190, "PARAM_01", -1, 5)]
+        assert station.of(messages.ParamError) == [messages.ParamError(255, 190, "PARAM_01", -1, 5)]
         assert by_name(station)["PARAM_01"] == struct.pack("<i", 1)
         await station.ask_file(Opcode.CREATE_FILE, data=b"a.txt")
         await station.ask_file(Opcode.LIST_DIRECTORY, data=b"/")
@@ -1205,7 +1198,7 @@ async def test_a_station_that_floods_and_one_that_sends_garbage() -> None:
         await station.ask(LIST, *asked, seconds=1.5)
         assert len(station.of(ParamValue)) >= 904
         assert by_name(station)["MC_ROLL_P"] == struct.pack("<f", 3)
-        assert [each.param_id for each in station.of(ParamError)] == ["UNKNOWN"]
+        assert [each.param_id for each in station.of(messages.ParamError)] == ["UNKNOWN"]
         assert len(requested(vehicle)) < 200
         assert not vehicle.messages(messages.CommandLong)
         assert max(len(each.files) for each in served.gateway.stations) == kept_file.OPEN_FILES_MAX
