@@ -111,15 +111,18 @@ def test_get_and_fetch_read_every_vehicle(command: Command, put: Put) -> None:
 
 
 def test_all_reads_other_components_that_have_parameters_and_names_those_without(
-    command: Command, put: Put
+    command: Command, put: Put, tmp_path: Path
 ) -> None:
     cameras = [Camera(component=100), Camera(component=101, plain={"ZOOM": 2})]
     gimbal = Partial({"PAN": (3, ParamType.INT8)}, serves=("indices",), first=1, component=154)
-    url = put(Air([px4(), *cameras, gimbal]))
+    lister = Partial({"TILT": (3, ParamType.INT8)}, serves=("list",), component=155)
+    url = put(Air.symmetric([px4(), *cameras, gimbal, lister], delay=0.1))
     fetched = command("fetch", url, "--vehicle", "all")
     assert fetched.code == 0, fetched.err
     found = [" ".join(line[:2]) for line in fetched.words[1:]]
-    assert found == ["1/1 A", "1/1 B", "1/154 PAN", "1/101 ZOOM"]
+    assert found == ["1/1 A", "1/1 B", "1/154 PAN", "1/155 TILT", "1/101 ZOOM"]
+    command("save", url, path := tmp_path / "gimbal.params", "--vehicle", "1/155")
+    assert "# 1 parameter of 1/155\n" in path.read_text(), "it is no px4"
     assert "1/100 camera has no parameters, or none within 2.5 s" in fetched.err
     assert command("set", url, "ZOOM", 3, "--vehicle", "all").code == 2
     assert not cameras[1].requests["PARAM_SET"]
