@@ -186,7 +186,8 @@ async def _from_file(
         params = choose(file, session.choice.component, session.component.system)
         own, origin = session.component.identity, params.identity
         has_uid = origin is not None and origin.uid is not None
-        if own.uid and not has_uid and (session.choice.uid or own.uid in params.source):
+        is_named = own.uid and any(own.uid in each for each in (params.source, *file.header))
+        if own.uid and not has_uid and (session.choice.uid or is_named):
             params = replace(params, identity=replace(origin or own, uid=own.uid))
         return State(params, is_restore, partial, ExitCode.USAGE if file.left_out else ExitCode.DONE)
 
@@ -429,8 +430,8 @@ class _Job:
             if left_out := Counter(row.category for row in found.shown_rows if row.category in _INCLUDABLE):
                 counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
                 includes = " ".join(f"--include {category}" for category in left_out)
-                uid, origin = session.component.identity.uid, self.state.params.identity
-                is_own = uid is not None and origin is not None and origin.uid == uid
+                identity, origin = session.component.identity, self.state.params.identity
+                is_own = origin is not None and origin.uid is not None and origin.is_same_vehicle(identity)
                 own = ", ".join(each for each in left_out if is_own and each in OWN_STATE_CATEGORIES)
                 includes += f"; restore writes this vehicle's own {own} too" if own else ""
                 remarks.append(f"left out: {counts}; to write them: {includes}")
