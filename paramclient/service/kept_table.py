@@ -145,11 +145,9 @@ def listed(session: Session) -> list[ReportedValue]:
     return [value_of(session, param, index=index) for index, param in known if param is not None]
 
 
-def whole_list(session: Session) -> list[ReportedValue] | None:
-    """Return the answers to a request for the list of a table in sync; None while it cannot be decoded."""
+def whole_list(session: Session) -> list[ReportedValue]:
+    """Return the answers to a request for the list of a table in sync."""
     values, digest = listed(session), digest_of(session)
-    if not values:
-        return None
     return values if digest is None else [digest, *values]
 
 

@@ -154,8 +154,7 @@ class _Behind:
         return self._at
 
     def data_to_send(self) -> list[bytes]:
-        data = list(self._partner.datagrams)
-        self._partner.datagrams.clear()
+        data, self._partner.datagrams = self._partner.datagrams, []
         return data
 
 

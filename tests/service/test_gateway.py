@@ -325,10 +325,11 @@ async def test_rule_2_the_file_of_a_px4_is_padded_for_pieces_of_239_bytes() -> N
 
 @pytest.mark.parametrize("query", ["?colour=1", "?start=x", "?start=9999", "?withdefaults=2"])
 async def test_rule_2_a_query_that_the_table_does_not_answer_is_passed(query: str) -> None:
-    async with in_sync(ArduPilotVehicle()) as (_, vehicle, station):
+    async with in_sync(ArduPilotVehicle()) as (served, vehicle, station):
+        (await served.clients[0].component()).watch.doubt()
         data = f"@PARAM/param.pck{query}".encode()
-        assert await station.ask_file(Opcode.OPEN_FILE_RO, data=data)
-        assert vehicle.messages(FileTransfer)
+        assert await station.ask_file(Opcode.OPEN_FILE_RO, data=data, seconds=2.0)
+        assert data in [Packet.unpack(each.payload).data for each in vehicle.messages(FileTransfer)]
 
 
 def test_rule_2_a_file_with_defaults_that_are_unknown_is_one_without() -> None:
@@ -534,14 +535,16 @@ async def test_rule_3_cached_values_are_never_served(tmp_path: Path) -> None:
 
 async def test_rule_3_a_lost_vehicle_is_silent() -> None:
     async with in_sync(small_px4()) as (_, vehicle, station):
-        vehicle.is_mute = True
-        await anyio.sleep(6.0)
-        vehicle.received.clear()
         read, write = ParamRequestRead(1, 1, "PARAM_01", -1), set_to("PARAM_01", 5)
+        vehicle.is_mute = vehicle.is_deaf = True
+        await anyio.sleep(3.5)
+        await station.ask(write, seconds=3.0)  # the vehicle is lost before an error is due
+        assert not station.frames
+        vehicle.received.clear()
         await station.ask(LIST, read, write, seconds=5.0)
         assert not station.frames
         assert not askers(vehicle)
-        vehicle.is_mute = False
+        vehicle.is_mute = vehicle.is_deaf = False
         await anyio.sleep(10.0)
         assert not station.of(ParamValue)
         assert not vehicle.messages(ParamSet)
@@ -730,10 +733,13 @@ async def test_rule_6_queues_are_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
     async with gateway_over(small_px4()) as served:
         station = served.partner()
         await station.ask(GCS)
+        for station.address in [(system, 190) for system in range(100, 200)]:
+            station.send(GCS)
         served.link.is_stuck = True
         await anyio.sleep(30.0)
         [there] = served.gateway.stations
         assert there.dropped > 10
+        assert len(there.sources) == stations.SOURCES_MAX
         station.clear()
         for stream in range(20):
             there.stream(stream, (1, 1), iter([GCS]))
@@ -950,6 +956,9 @@ async def test_rule_11_a_loop_ends() -> None:
         vehicle.received.clear()
         assert await listed(station) == 26
         assert not requested(vehicle)  # the loop is no second vehicle
+        loop.say_bytes(b"".join(station.datagrams * 2))  # as a router may pack them
+        await station.ask()
+        assert not station.of(ParamValue)
 
 
 async def test_rule_11_neither_an_echo_of_the_radio_nor_a_key_reaches_a_station() -> None:
