@@ -254,10 +254,10 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
 async def _try(session: Session, which: str | int) -> ReportedValue | None:
     """Read a parameter that the component has; return None, and remember it, if that is not answered.
 
-    One that is lost meanwhile is asked no more.
+    One that is lost meanwhile, or answers no reads of either kind, is asked no more.
     """
     channel = session.channel
-    if channel.is_lost:
+    if channel.is_lost or [*session.serves_reads.values()] == [False, False]:
         return None
     requests = max(channel.timing.attempts_for(CONTROL_LOST), CONTROL_REQUESTS_MIN)
     with channel.inbox((session.dialect.value, which)) as inbox:

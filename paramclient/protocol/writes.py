@@ -265,9 +265,8 @@ class _Write:
                     sets_max = min(max(self.channel.timing.attempts_for(SETS_LOST), SETS_MIN), SETS_MAX)
                     now = anyio.current_time()
                     if self.attempts >= (SETS_MIN if now - self._began > SETS_TIME else sets_max):
-                        answer = await self._wanted_behind(inbox, now) or await self._read(inbox)
-                        if self._is_wanted(answer):
-                            return self._result(answer)
+                        if wanted := await self._wanted_behind(inbox, now):
+                            return self._result(wanted)
                         raise self._not_applied(answer)
                 elif adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
                     wanted = await self._wanted_behind(inbox, self._began)

@@ -65,7 +65,7 @@ async def test_any_part_suffices_to_read_and_to_prove_a_set(
 )
 async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(parts: tuple[str, ...]) -> None:
     vehicle = Partial(serves=parts)
-    async with talking(vehicle) as (_, session):
+    async with talking(Air.symmetric([vehicle], delay=0.15)) as (_, session):
         with (
             pytest.raises(errors.ValueNotApplied, match="1/1 keeps MODE at 5") as caught,
             anyio.fail_after(15.0),
