@@ -22,7 +22,7 @@ HEARTBEAT_WAIT: Final = 1.2
 PX4_WITH_FILE: Final = 0x01120000
 """flight_sw_version of the first PX4 that serves the packed parameter file: 1.18."""
 VERSION_ATTEMPTS_MAX: Final = 8
-"""Requests for AUTOPILOT_VERSION: cameras and radios often have none, and a fetch of them waits for all these."""
+"""Requests for AUTOPILOT_VERSION: cameras and radios often have none, and a fetch waits for all of them."""
 VERSION_COPIES: Final = 2
 """Copies of each repeated request: without its answer, a cached table cannot be loaded, and is downloaded."""
 VERSION_ATTEMPTS_REFUSED: Final = 4
