@@ -124,7 +124,8 @@ def loads(
         data: the complete file. It includes no others, as bytes have no folder.
         source: the file's name, for errors and `ParamSet.source`.
         file_format: the format; None to detect it.
-        partial: leave out parameters with a name that no vehicle can have, and note their lines.
+        partial: leave out parameters that cannot be taken, such as those with a name that no vehicle can
+            have or a value that is no number, and note their lines. A fault of the whole file is an error.
 
     Raises:
         FileError: unknown format, damaged, or without parameters. The error names up to 20 bad lines; for a
@@ -160,6 +161,7 @@ def _read(reading: Reading, file_format: FileFormat | str | None) -> ParamFile:
     if len(reading.data) > LARGEST_FILE:
         raise FileError(f"a parameter file has at most {LARGEST_FILE} bytes", source=reading.source)
     try:
+        reading.partial &= kind_of(reading.data) is None  # a file of another kind is no part of a file
         chosen = _format_of(reading) if file_format is None else FileFormat(file_format)
         return _FORMATS[chosen].read(reading, chosen)
     except FileError as error:

@@ -64,7 +64,7 @@ class ParamFile:
         header: the comment lines at the top, without comment characters.
         footer: the comment lines after the last parameter. All others belong to the parameter below them.
         notes: remarks for the user, in sentences: repeated lines, parts left out.
-        left_out: number of parameters whose name no vehicle can have, see `partial` of `read_file`.
+        left_out: number of faults for which parameters were left out, see `partial` of `read_file`.
     """
 
     sets: tuple[ParamSet, ...]

@@ -84,15 +84,15 @@ def read_json_text(text: str, source: str) -> Any:
         raise FileError(str(error.args[0]), source=source, line=line) from None
 
 
-def _fault(reading: Reading, place: Place, what: str, *, is_name: bool = False) -> None:
+def _fault(reading: Reading, place: Place, what: str) -> None:
     """Add a fault at a position of the document."""
-    line = None
-    if "params" in place[:-1] and reading.fault_count < FAULTS_MAX:
+    line, is_row = None, "params" in place[:-1]
+    if is_row and reading.fault_count < FAULTS_MAX:
         line = _line_of(reading.text, str(place[place.index("params") + 1]))
     described = f"{'.'.join(map(str, place)) or 'the document'}: {what}"
     if len(described) > FAULT_LENGTH_MAX:
         described = f"{described[:FAULT_LENGTH_MAX]}…"
-    reading.fault(line, described, is_name=is_name)
+    reading.fault(line, described, is_row=is_row)
 
 
 def _checked(
@@ -187,7 +187,7 @@ def _set(reading: Reading, content: object, place: Place) -> ParamSet:
         try:
             check_name(name)
         except UsageError as error:
-            _fault(reading, at, str(error), is_name=True)
+            _fault(reading, at, str(error))
             continue
         if not is_portable_name(name):
             at_line = "" if (line := _line_of(reading.text, name)) is None else f"line {line}: "

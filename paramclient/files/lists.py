@@ -133,8 +133,7 @@ class _Pairs:
             return value
         else:
             problem = " with a number" if len(words) == 2 else ""
-        is_name = not problem and len(words) > 2 and parse_number(words[-1]) is not None and value is None
-        self._reading.bad_line(line, f"{self._expected}{problem}", source, is_name=is_name)
+        self._reading.bad_line(line, f"{self._expected}{problem}", source)
         return None
 
     def _include(self, line: TextLine, path: str, source: str, chain: tuple[Path, ...]) -> None:
@@ -142,9 +141,10 @@ class _Pairs:
         try:
             self._read_included(path, source, chain)
         except UsageError as error:
-            self._reading.bad_line(line, f"@include with a file that can be read ({error})", source)
+            expected = f"@include with a file that can be read ({error})"
+            self._reading.bad_line(line, expected, source, is_row=False)
             return
-        if self._reading.fault_count > before:
+        if self._reading.fault_count > before and not self._reading.partial:
             self._reading.fault(line.number, "includes that file", source=source)
 
     def _read_included(self, path: str, source: str, chain: tuple[Path, ...]) -> None:

@@ -52,7 +52,7 @@ class Reading:
     Args:
         data: the content.
         source: the file's name.
-        partial: leave out parameters with a name that no vehicle can have, with a note; else it is a fault.
+        partial: leave out parameters that cannot be taken, with a note; else no parameter is taken.
         is_on_disk: whether the file can include others: bytes have no folder.
     """
 
@@ -60,12 +60,13 @@ class Reading:
         self.data = data
         self.source = source
         self.is_on_disk = is_on_disk
+        self.partial = partial
         self.fault_count = 0
         self.notes: list[str] = []
-        self._partial = partial
         self._faults: list[tuple[str, int | None, str]] = []
+        self._is_damaged = False  # by a fault that is not of one parameter
         self._sets: dict[tuple[int | None, int | None], dict[str, tuple[WrittenParam, str]]] = {}
-        self._repeated = self._left_out = 0
+        self._repeated = 0
         self.foreign: list[str] = []  # places of comments that are not UTF-8
 
     @cached_property
@@ -83,39 +84,35 @@ class Reading:
             raise FileError("the file contains no parameters", source=self.source)
         return first
 
-    def fault(self, line: int | None, what: str, source: str = "", *, is_name: bool = False) -> None:
+    def fault(self, line: int | None, what: str, source: str = "", *, is_row: bool = False) -> None:
         """Add a fault.
 
         Args:
             line: the bad line; None for an unknown one.
             what: the fault, as the end of a sentence.
             source: the file, if it is another one.
-            is_name: whether only the name of a parameter is bad.
+            is_row: whether only one parameter is bad.
         """
-        if is_name and self._partial:
-            place = _place("" if source == self.source else source, line)
-            self.notes.append(f"{place + ': ' if place else ''}{what}; left out.")
-            self._left_out += 1
-            return
         if self.fault_count < FAULTS_MAX:
             self._faults.append((source or self.source, line, what))
         self.fault_count += 1
+        self._is_damaged |= not is_row
 
     def has_name(self, line: TextLine, name: str, expected: str, source: str = "") -> bool:
         """Return whether a vehicle can have the name in a line; else add the line."""
         try:
             check_portable_name(name)
         except UsageError as error:
-            self.bad_line(line, f"{expected} ({error})", source, is_name=True)
+            self.bad_line(line, f"{expected} ({error})", source)
             return False
         return True
 
-    def bad_line(self, line: TextLine, expected: str, source: str = "", *, is_name: bool = False) -> None:
+    def bad_line(self, line: TextLine, expected: str, source: str = "", *, is_row: bool = True) -> None:
         """Add a line that has other content than expected."""
         what = f"expected {expected}, found {excerpt(line.text)}"
         if byte := _undecoded.search(line.text):
             what = f"expected UTF-8 text, found the byte 0x{ord(byte[0]) - 0xDC00:02x}"
-        self.fault(line.number, what, source, is_name=is_name)
+        self.fault(line.number, what, source, is_row=is_row)
 
     def add(
         self, param: WrittenParam, place: str, system: int | None = None, component: int | None = None
@@ -146,31 +143,29 @@ class Reading:
         Raises:
             FileError: the file has faults, all of which the error has, or no parameters.
         """
-        if self._faults:
-            (source, line, what), *others = self._faults
-            rest = [": ".join(filter(None, (_place(of, at), each))) for of, at, each in others]
-            if self.fault_count > len(self._faults):
-                rest.append(f"and {self.fault_count - len(self._faults)} more")
-            raise FileError(what, source=source, line=line, more=tuple(rest))
         if sets is None:
             sets = tuple(
                 ParamSet({name: p for name, (p, _) in each.items()}, component, system, source=self.source)
                 for (system, component), each in self._sets.items()
             )
+        is_refused = self._is_damaged or not self.partial or not any(sets)
+        own = "" if is_refused else self.source  # which stands before each note
+        faults = [FileError(what, source="" if of == own else of, line=at) for of, at, what in self._faults]
+        told = [*map(str, faults)]
+        if (more := self.fault_count - len(told)) > 0:
+            told.append(f"and {more} more")
+        if told and is_refused:
+            first = faults[0]
+            raise FileError(first.reason, source=first.source, line=first.line, more=tuple(told[1:]))
         if not any(sets):
             raise FileError("the file contains no parameters", source=self.source)
+        self.notes += [f"{each}; left out." for each in told]
         if (more := self._repeated - FAULTS_MAX) > 0:
             self.notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")
         if self.foreign:
             places = first_of(self.foreign, FAULTS_MAX)
             self.notes.append(f"Comments that are not UTF-8 were read as Windows-1252: {places}.")
-        return ParamFile(sets, file_format, self.source, header, footer, tuple(self.notes), self._left_out)
-
-
-def _place(source: str, line: int | None) -> str:
-    if line is None:
-        return source
-    return f"{source}:{line}" if source else f"line {line}"
+        return ParamFile(sets, file_format, self.source, header, footer, tuple(self.notes), self.fault_count)
 
 
 def _repetition(before: WrittenParam, at: str, param: WrittenParam, place: str) -> str:

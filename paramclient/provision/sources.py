@@ -59,8 +59,7 @@ async def resolve(
     2. `cache:VEHICLE`, or a text that can only name a vehicle in the cache (see `paramclient.cache.lookup`).
     3. Any other text: a link. The whole table is fetched, from the cache if the vehicle confirms it.
 
-    `./1` is a file, `cache:1` the vehicle. Names that no vehicle can have are left out of a file, with a
-    warning that names their lines.
+    `./1` is a file, `cache:1` the vehicle.
 
     Args:
         text: the file, the vehicle or the link.
@@ -69,12 +68,12 @@ async def resolve(
         cache: as in `ParamClient`; False excludes vehicles of the cache.
 
     Raises:
-        UsageError: the text names none of the three; a file cannot be read (FileError).
+        UsageError: the text names none of the three; a file, or a line of it, cannot be read (FileError).
         UnknownVehicle, AmbiguousVehicle, CacheError: as `tables_in`.
         VehicleError: some parameters were not received; the message names them, or counts those in the cache.
         NoReply, LinkError: as from `ParamClient.component` and `Component.fetch_all`.
     """
-    read = partial(read_source, text, component=component, extended=extended, cache=cache)
+    read = partial(read_source, text, component=component, extended=extended, partial=False, cache=cache)
     if (found := await anyio.to_thread.run_sync(read)) is not None:  # a log of 100 MB takes seconds
         return choose(found, component, system)
     link = link_of(text)
@@ -91,6 +90,7 @@ def read_source(
     every: bool = False,
     extended: bool = False,
     incomplete: bool = False,
+    partial: bool = True,
     cache: ParamCache | str | bool | None = None,
 ) -> ParamFile | None:
     """Return the sets of a file, of a log, or of a vehicle of the cache; None if the text names a link.
@@ -99,12 +99,13 @@ def read_source(
         text, component, extended, cache: as in `resolve`; `component` selects only a table of the cache.
         every: all tables of a vehicle of the cache, instead of that of its autopilot.
         incomplete: also an incomplete table of the cache, whose source says so.
+        partial: leave out the lines of a file that cannot be read, with a warning for each.
 
     Raises:
         ParamClientError: as in `resolve`.
     """
     if is_file(text):
-        return _read(text)
+        return _read(text, partial=partial)
     if not is_offline(text):
         return None
     if cache is False:
@@ -124,15 +125,15 @@ def read_source(
     return ParamFile(tuple(sets), FileFormat.JSON, sets[0].source)
 
 
-def _read(path: str) -> ParamFile:
+def _read(path: str, *, partial: bool) -> ParamFile:
     """Read a parameter file, or the values at the end of an on-board log; its notes become warnings."""
     if path == STANDARD_INPUT:
-        file = loads(sys.stdin.buffer.read(LARGEST_FILE + 1), source="standard input", partial=True)
+        file = loads(sys.stdin.buffer.read(LARGEST_FILE + 1), source="standard input", partial=partial)
     elif is_onboard_log(path):
         log = read_onboard_log(path)
         file = ParamFile((log.at_end(),), log.file_format, path, notes=log.notes)
     else:
-        file = read_file(path, partial=True)
+        file = read_file(path, partial=partial)
     for note in file.notes:
         logger.warning("%s: %s", file.source, note)
     return file

@@ -82,10 +82,16 @@ def test_apply_sets_and_verifies_values_that_differ(command: Command, put: Put, 
     assert vehicle.requests["PARAM_SET"] == 2
 
 
-@pytest.mark.parametrize("name", ["quad.param", "{system}.param"])
-def test_an_impossible_name_is_skipped_by_partial(command: Command, put: Put, file: File, name: str) -> None:
-    vehicle = copter()
-    wrong = file("RTL_ALT,2500\nSIM_GPS1_BYTELOSS,0\n", name.format(system=1))
+IMPOSSIBLE = {
+    "quad.param": "RTL_ALT,2500\nSIM_GPS1_BYTELOSS,0\n",
+    "{system}.param": "RTL_ALT,2500\nWPNAV_SPEED,fast\n",
+    "quad.params": "1\t1\tRTL_ALT\t2500\t6\n1\t1\tWPNAV_SPEED\t1e39\t9\n",
+}
+
+
+@pytest.mark.parametrize("name", IMPOSSIBLE)
+def test_an_impossible_line_is_skipped_by_partial(command: Command, put: Put, file: File, name: str) -> None:
+    vehicle, wrong = copter(), file(IMPOSSIBLE[name], name.format(system=1))
     for options, code, value in (((), 2, 1500), (("--partial",), 2, 2500)):
         outcome = command("apply", put(vehicle), wrong.with_name(name), *options)
         assert (outcome.code, vehicle.values["RTL_ALT"]) == (code, value)

@@ -417,20 +417,29 @@ def test_a_control_character_in_a_comment_is_no_fault() -> None:
     assert [*loads(b"A,1\n# \x00\nB,2 # \x07\n", source="quad.param").choose()] == ["A", "B"]
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        *(f"A,1\n{name},0\nB,2\n" for name in BAD_NAMES),
-        *(f"1\t1\tA\t1\t6\n1\t1\t{name}\t0\t6\n1\t1\tB\t2\t6\n" for name in BAD_NAMES),
-        '{"paramclient": 1, "sets": [{"params":{"A":{"value":1},\n"SIM_GPS1_BYTELOSS":{},"B":{"value":2}}}]}',
+ROWS = {
+    "A,1\n?\nB,2\n": [*(f"{name},0" for name in BAD_NAMES), "C,one", "C", "C,1,5", "C,1e999", "C,1 m"],
+    "1\t1\tA\t1\t6\n1\t1\t?\n1\t1\tB\t2\t6\n": [*(f"{name}\t0\t6" for name in BAD_NAMES), "C\t1e39\t9", "C"],
+    '{"paramclient": 1, "sets": [{"params": {"A": {"value": 1},\n?, "B": {"value": 2}}}]}': [
+        *('"SIM_GPS1_BYTELOSS": {}', '"C": {"value": 300, "type": "INT8"}', '"C": {"value": "x"}', '"C": 1'),
     ],
-)
-def test_a_name_that_no_vehicle_has_is_left_out_on_request(text: str) -> None:
+}
+
+
+@pytest.mark.parametrize("text", [text.replace("?", row) for text, rows in ROWS.items() for row in rows])
+def test_a_parameter_that_cannot_be_taken_is_left_out_on_request(text: str) -> None:
     assert failed(text).line == 2
     file = loads(text.encode(), source="quad.x", partial=True)
     assert {name: param.value for name, param in file.sets[0].items()} == {"A": 1, "B": 2}
-    assert [note[:8] for note in file.notes] == ["line 2: "]
-    assert failed("A,1\nB,one\nTHIS_NAME_IS_TOO_LONG,1\n", partial=True).line == 2, "no bad value"
+    assert ([note[:8] for note in file.notes], file.left_out) == (["line 2: "], 1)
+
+
+def test_a_fault_of_the_whole_file_is_an_error_also_on_request_of_a_part() -> None:
+    document = '{"paramclient": 1, "sets": [{"system": 0, "params": {"A": {"value": 1}}}]}'
+    for text in ("bad\nbad\n", "A,1\n@include missing.param\n", "<html>\nA = 1\n", document):
+        assert failed(text, partial=True)
+    more = loads(b"A,1\n" + b"bad\n" * 50, partial=True)
+    assert (more.left_out, len(more.notes), more.notes[-1]) == (50, 21, "and 30 more; left out.")
 
 
 # Format detection
