@@ -419,7 +419,7 @@ class KeptTable(Stream[Change]):
                 beats_min = self.beats + OVERTAKING_BEATS * self.is_loading
                 with anyio.move_on_after(SET_TIMEOUT) as scope:
                     async with first.station.writing:
-                        code = await self._write(key, f"station {first.system}/{first.component}")
+                        code = await self._write(key, f"station {first.system}/{first.component}", scope)
                 is_open = scope.cancelled_caught and self.beats < beats_min and not self.is_lost
         except ParamClientError as error:
             code = _code_of(error)
@@ -428,10 +428,11 @@ class KeptTable(Stream[Change]):
         if code:
             self._reject(askers, key, code)
 
-    async def _write(self, key: SetKey, author: str) -> ParamErrorCode:
+    async def _write(self, key: SetKey, author: str, scope: anyio.CancelScope) -> ParamErrorCode:
         """Write a value, and acknowledge it to the askers.
 
-        A component that takes values byte by byte takes those of its own type only.
+        A component that takes values byte by byte takes those of its own type only. Where a read of it was
+        answered late, behind the list of a fetch, an acknowledgement will be too: the time begins anew.
 
         Raises:
             ParamClientError: as from `Component.set`.
@@ -444,6 +445,8 @@ class KeptTable(Stream[Change]):
         askers, params = self._sets[key], session.table.params
         if name not in params or params[name].trust is Trust.CACHED:
             await read(session, name)
+            if self.is_loading:
+                scope.deadline = anyio.current_time() + SET_TIMEOUT
         known = params[name].type
         if number != known and (is_extended or session.table.encoding is not Encoding.C_CAST):
             return ParamErrorCode.TYPE_MISMATCH

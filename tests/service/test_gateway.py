@@ -638,8 +638,7 @@ async def test_rule_4_different_sets_queue() -> None:
         await second.ask(set_to("PARAM_01", 9), seconds=0.01)
         await first.ask(set_to("PARAM_01", 33), seconds=5.0)
         component = await served.clients[0].component()
-        await component.get("PARAM_01")
-        assert component.params["PARAM_01"].value == 33
+        assert (await component.get("PARAM_01")).value == 33
         assert by_name(first)["PARAM_01"] == by_name(second)["PARAM_01"] == struct.pack("<i", 33)
 
 
@@ -674,9 +673,10 @@ async def test_rule_4_an_ardupilot_takes_names_in_any_case_and_values_of_any_typ
         assert by_name(station) == {"ANGLE_MAX": struct.pack("<f", 3)}
 
 
-async def test_rule_4_a_set_during_the_fetch_has_its_result_when_the_radio_brings_it() -> None:
+@pytest.mark.parametrize("queue", [12_288, None])
+async def test_rule_4_a_set_during_the_fetch_has_its_result_with_the_list(queue: int | None) -> None:
     """The acknowledgement waits behind the list; an error after 3 s would be wrong."""
-    async with gateway_over(Air.symmetric([PX4Vehicle()], delay=0.02, rate=5_760.0)) as served:
+    async with gateway_over(Air.symmetric([PX4Vehicle()], delay=0.02, rate=5_760.0, queue=queue)) as served:
         await served.clients[0].component()
         station = served.partner()
         await station.ask(LIST, seconds=2.0)
