@@ -94,6 +94,8 @@ def problem_response(error: Exception) -> Response:
         first = error.errors()[:FAULTS_MAX]
         faults = [f"{'.'.join(str(part)[:100] for part in each['loc'])}: {each['msg']}" for each in first]
         status, kind, detail = 422, "invalid-request", "; ".join(faults)
+    elif isinstance(error, HTTPException) and error.status_code == HTTPStatus.BAD_REQUEST:
+        status, kind, detail = 422, "invalid-request", error.detail  # FastAPI's, of a body that is no text
     elif isinstance(error, HTTPException):
         status, detail, headers = error.status_code, error.detail, error.headers
         kind = HTTPStatus(status).phrase.lower().replace(" ", "-")

@@ -44,8 +44,6 @@ from paramclient.service.problems import ServiceError
 from paramclient.version import __version__
 
 VEHICLE: Final = "/api/vehicles/{system}/{component}"
-HISTORY_ENTRIES: Final = 100
-"""Default number of entries of a history."""
 PROGRESS_INTERVAL: Final = 0.25
 """Seconds between two progress events of an apply or restore."""
 FILE_BYTES_MAX: Final = 2 * 2**20
@@ -228,7 +226,6 @@ bearer = Depends(HTTPBearer(auto_error=False))  # described here, and checked be
 public = APIRouter()
 reading = APIRouter(dependencies=[bearer])
 writing = APIRouter(dependencies=[bearer, Depends(require_write)])
-ROUTERS: Final = (public, reading, writing)
 
 
 async def _hub_of(request: Request) -> Hub:
@@ -501,7 +498,7 @@ async def create_snapshot(target: TargetArgument, body: SnapshotRequest) -> Json
 async def history(
     target: TargetArgument,
     name: Annotated[str | None, Query(max_length=16)] = None,
-    limit: Annotated[int, Query(ge=1, le=1_000)] = HISTORY_ENTRIES,
+    limit: Annotated[int, Query(ge=1, le=1_000)] = 100,
     since: Annotated[AwareDatetime | None, Query(description="Only from this time on.")] = None,
 ) -> JsonObject:
     """Return the newest changes of values, the newest last."""

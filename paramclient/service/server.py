@@ -17,7 +17,7 @@ import socket
 from collections.abc import Callable, Generator, Mapping
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import anyio
 import uvicorn
@@ -44,8 +44,6 @@ CONNECTIONS_MAX: Final = 200
 """Maximum number of connections, and of requests; further ones get the status 503."""
 IDLE_TIMEOUT: Final = 30
 """Seconds after which an idle connection is closed."""
-PORT_MAX: Final = 65_535
-"""The highest TCP port."""
 SHUTDOWN_TIMEOUT: Final = 1
 """Seconds for responses in progress at shutdown; their requests are then cancelled."""
 
@@ -237,6 +235,16 @@ def cancel_on_disconnect(app: ASGIApp) -> ASGIApp:
 # the application
 
 
+class _Application(FastAPI):
+    """FastAPI whose description is valid OpenAPI 3.1: the schema of an event is of 3.2."""
+
+    def openapi(self) -> dict[str, Any]:
+        described = super().openapi()
+        content = described["paths"]["/api/events"]["get"]["responses"]["200"]["content"]
+        content["text/event-stream"] = {"schema": {"type": "string"}}
+        return described
+
+
 def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
     """Create the application over a hub, which the caller opens and closes.
 
@@ -244,7 +252,7 @@ def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
         hub: links and cache.
         tokens: the valid tokens; None lets every program of this computer read and write.
     """
-    app = FastAPI(
+    app = _Application(
         title="paramclient",
         version=__version__,
         summary="MAVLink parameters of the vehicles on the links of this service",
@@ -257,7 +265,7 @@ def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
     app.add_middleware(RequestBodyLimitMiddleware, max_body_size=BODY_BYTES_MAX)
     app.add_middleware(cancel_on_disconnect)
     app.add_middleware(guard, tokens=tokens)
-    for router in routes.ROUTERS:
+    for router in (routes.public, routes.reading, routes.writing):
         app.include_router(router)
     app.mount("/", StaticFiles(packages=[("paramclient.service", "page")], html=True))
     return app
@@ -283,7 +291,7 @@ def listen_at(address: str, *, is_protected: bool) -> tuple[socket.socket, str]:
         LinkError: the address cannot be listened on.
     """
     found = _ADDRESS.fullmatch(address)
-    if found is None or not 0 <= int(found[3] or -1) <= PORT_MAX:
+    if found is None or int(found[3] or 65_536) > 65_535:  # the highest TCP port
         raise UsageError(f"{address!r} is not HOST:PORT such as 127.0.0.1:8765 or [::1]:0")
     host, family = (found[1], socket.AF_INET6) if found[1] else (found[2], socket.AF_INET)
     if not (is_protected or _is_loopback(host)):

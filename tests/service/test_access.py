@@ -245,8 +245,7 @@ async def test_no_broken_body_is_taken_or_breaks_the_service() -> None:
                 for media_type in ("application/json", "text/plain"):
                     headers = {"Content-Type": media_type}
                     answer = await browser.request(method, address, content=body, headers=headers)
-                    assert 400 <= answer.status_code < 500, (address, body[:80], answer.text)
-                    assert answer.headers["content-type"] == "application/problem+json"
+                    problem(answer, 422, "invalid-request")
         assert {name: vehicle.param(name).value for name in VALUES} == VALUES
 
 
