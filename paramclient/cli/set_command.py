@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial as bind
 from typing import Annotated, ClassVar, Protocol, Self
@@ -19,13 +18,13 @@ from paramclient.cli.json_output import JsonObject, info_of, outcome_json, vehic
 from paramclient.cli.metadata import MetadataChoice, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import Status, code_of, report, require_consent, say
-from paramclient.cli.session import CommandSession, Sessions, Shown, sessions, spelling, suggest_names
+from paramclient.cli.session import CommandSession, Sessions, Shown, get_chosen, sessions, spelling
 from paramclient.client.component import SETTLE_MAX
-from paramclient.errors import UnknownParameter, UsageError
+from paramclient.errors import ParamClientError, UsageError, VehicleError
 from paramclient.metadata import Metadata
 from paramclient.metadata.info import ParamInfo, number_of
 from paramclient.model.names import is_pattern
-from paramclient.model.values import ParamType, Value, check_name, format_value, parse_ext_value
+from paramclient.model.values import ParamType, Value, bits_of, check_name, parse_ext_value
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 
 
@@ -42,10 +41,10 @@ async def set_(
 
     A value is a decimal or hexadecimal number (0x1F), nan or inf; of an extended parameter also text, or
     bytes as hex:00FF. It may also be the name of a value, or names of bits separated by |, if metadata
-    describes the parameter: it is downloaded from the vehicle unless --metadata names a file. A refused value
-    does not stop the others. If several vehicles are heard, --vehicle must choose one, or all. A value
-    outside the range in the metadata, or a fraction for an integer parameter, is written only after
-    confirmation on a terminal, or with --force.
+    describes the parameter: it is downloaded from the vehicle unless --metadata names a file. A value that
+    the vehicle refuses does not stop the others. If several vehicles are heard, --vehicle must choose one, or
+    all. If a value is outside the range in the metadata, or the type of its parameter cannot hold it, values
+    are written only after confirmation on a terminal, or with --force.
 
     Args:
         url: The link.
@@ -68,7 +67,7 @@ async def set_(
             if doubts and not force:
                 receivers = ", ".join(session.receiver for session in jobs)
                 question = f"Write these values to {receivers} all the same?"
-                await require_consent(question, "--force writes these values all the same")
+                await require_consent(question, "--force writes what can be written")
             return found.show(await found.work(lambda session: jobs[session].write()))
 
 
@@ -99,41 +98,33 @@ async def _prepare(
 ) -> SetJob:
     """Return names and values as the vehicle and its metadata have them.
 
-    The types of extended parameters are read, as their texts have values only with them.
+    The parameters are read first: texts of extended ones have values only with their types, and all values
+    are checked before one is written.
 
     Raises:
         UsageError: a text is no value of its parameter.
-        ParamClientError: a type could not be read.
     """
     component, job = session.component, SetJob(session, settle, force)
     if not component.is_extended:
         words = [pair for pair in texts.items() if number_of(pair[1]) is None]
         needed_for = "{}: {!r} is not a number".format(*words[0]) if words else ""
         job.described = await known_of_session(session, choice, needed_for=needed_for)
-    for given, text in texts.items():
-        name = spelling(given, component)
+    pairs = {spelling(given, component): text for given, text in texts.items()}
+    _, job.errors = await get_chosen(session, [*pairs])
+    for name, text in pairs.items():
+        known = component.params.get(spelling(name, component))
         if component.is_extended:
-            kind = await _type_of(session, name)
-            job.writes[name] = text if kind is None else parse_ext_value(name, text, kind)
+            job.writes[name] = text if known is None else parse_ext_value(name, text, known.type)
             continue
         info = info_of(job.described, name) or ParamInfo(name)
         job.writes[name] = value = info.parse(text)
         if (problem := info.problem(value)) is not None:
             job.doubts.append(problem)
-        if isinstance(value, float) and math.isfinite(value) and not value.is_integer():
-            kind = await _type_of(session, name)
-            if kind is not None and kind.is_integer:
-                job.doubts.append(f"{name}: {format_value(value)} is not a whole number, as the type needs")
+        try:
+            bits_of(value, ParamType.REAL64 if known is None else known.type)
+        except UsageError as error:
+            job.doubts.append(f"{name}: {error}")
     return job
-
-
-async def _type_of(session: CommandSession, name: str) -> ParamType | None:
-    """Return the type of a parameter; None if the vehicle has none of this name, which the write reports."""
-    component = session.component
-    with suppress(UnknownParameter):
-        known = component.params.get(name) or await component.get(name, timeout=session.deadline.left())
-        return known.type
-    return None
 
 
 # Writes
@@ -171,7 +162,9 @@ class SetJob:
         settle, force: as in `Component.set_many`.
         described: the metadata of the vehicle, or None.
         writes: the values by name.
-        doubts: sentences on values outside the range, and on fractions for integers.
+        errors: by name, why a parameter could not be read; its value is not sent, and if the vehicle did not
+            answer, none is.
+        doubts: sentences on values outside the range, and on those that the type cannot hold.
         outcomes: one for each value by name; *unknown* for those without one so far.
         has_begun: whether values may have been sent.
     """
@@ -183,6 +176,7 @@ class SetJob:
     force: bool
     described: Metadata | None = None
     writes: dict[str, Value] = field(default_factory=dict)
+    errors: dict[str, ParamClientError] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
     outcomes: dict[str, SetOutcome] = field(default_factory=dict)
     has_begun: bool = False
@@ -197,19 +191,23 @@ class SetJob:
         session, numbers = self.session, itertools.count(1)
         await session.check_only()
         self.has_begun = True
-        self.outcomes = {pair[0]: SetOutcome(*pair, SetStatus.UNKNOWN) for pair in self.writes.items()}
+        silent = next((each for each in self.errors.values() if not isinstance(each, VehicleError)), None)
+        for name, value in self.writes.items():
+            error = self.errors.get(name, silent)
+            status = SetStatus.REFUSED if isinstance(error, VehicleError) else SetStatus.NOT_TRIED
+            self.outcomes[name] = SetOutcome(name, value, status if error else SetStatus.UNKNOWN, None, error)
+        left = {each.name: each.requested for each in self.outcomes.values() if each.error is None}
 
         def update(outcome: SetOutcome) -> None:
             self.outcomes[outcome.name] = outcome
-            status.count(next(numbers), len(self.writes))
+            status.count(next(numbers), len(left))
 
         label, timeout = session.label, session.deadline.left()
         with Status(f"waiting for {label} to acknowledge PARAM_SET", f"setting {label}") as status:
             done = await session.component.set_many(
-                self.writes, progress=update, timeout=timeout, settle=self.settle, force=self.force
+                left, progress=update, timeout=timeout, settle=self.settle, force=self.force
             )
-        await suggest_names(session, [each.error for each in done.outcomes])
-        self.outcomes = {each.name: each for each in done.outcomes}
+        self.outcomes |= {each.name: each for each in done.outcomes}
         return self
 
     def as_json(self) -> JsonObject:

@@ -103,9 +103,8 @@ def test_a_terminal_shows_what_is_awaited(
     assert len(texts) == 7, "six times, and the erasure with the error after it"
     assert texts[-1].startswith("paramclient: no reply: ")
     for words, shown in (
-        (["get", "A"], "waiting for A of 1/1 px4 (0 s)."),
+        *((words, "waiting for A of 1/1 px4 (0 s).") for words in (["get", "A"], ["set", "A", 2])),
         (["fetch"], "fetching 1/1 px4: waiting for the first response (0 s)."),
-        (["set", "A", 2], "waiting for 1/1 px4 to acknowledge PARAM_SET (0 s)."),
     ):
         done = command(words[0], put(Deaf(table={"A": 1})), *words[1:])
         assert drawn(done.err)[0] == shown

@@ -107,8 +107,3 @@ def test_what_apply_leaves_out_is_left_out_unless_it_is_named(command: Command, 
     assert vehicle.values["COMPASS_OFS_X"] == 0.0
     named = command("reset", put(vehicle), "baro1_gnd_press")
     assert (named.code, named.rows[1][-2]) == (1, "refused")
-
-
-@pytest.mark.parametrize("words", [[], ["A", "--all"]])
-def test_names_and_all_exclude_each_other(command: Command, put: Put, words: list[str]) -> None:
-    assert command("reset", put(copter()), *words).code == 2

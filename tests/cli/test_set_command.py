@@ -42,18 +42,22 @@ def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> No
     small = (ParamType.INT8, 0)
     table: dict[str, Any] = {"A": 1.0, "COUNT": 3, "FIXED": 2.0, "SMALL": small}
     vehicle = ArduPilotVehicle(table=table, read_only=["FIXED"], live=(), ftp=False, param_error=True)
-    words = ["NO_SUCH=1", "COUNT", 7.6, "SMALL=300", "FIXED", 9, "A", 6]
+    words = ["NO_SUCH=1", "A", 6, "COUNT", 7.6, "SMALL=300", "FIXED", 9]
+    refused = command("set", put(vehicle), *words)
+    assert (refused.code, refused.out, vehicle.requests["PARAM_SET"]) == (2, "", 0)
+    assert "nothing was sent; --force writes what can be written" in refused.err
     done = command("set", put(vehicle), *words, "--force")
     assert done.code == 2
     assert [[row[0], *row[2:]] for row in done.rows[1:]] == [
         ["NO_SUCH", "refused", "1/1 has no NO_SUCH"],
+        ["A", "6.0", "accepted"],
         ["COUNT", "7", "adjusted"],
         ["SMALL", "refused", "300 does not fit INT8, which holds -128 to 127"],
         ["FIXED", "refused", "1/1 refused FIXED: read only"],
-        ["A", "6.0", "accepted"],
     ]
-    doubt, line = done.err.splitlines()
-    assert doubt == "paramclient: COUNT: 7.6 is not a whole number, as the type needs"
+    fraction, wide, line = done.err.splitlines()
+    assert fraction == "paramclient: COUNT: 7.6 is not a whole number, and the parameter is INT32"
+    assert wide == "paramclient: SMALL: 300 does not fit INT8, which holds -128 to 127"
     assert line == "1/1 ArduPilot quadrotor, firmware 4.6.0-dev: 1 accepted, 1 adjusted, 3 refused"
     assert vehicle.values["A"] == 6
     as_json = command("set", put(vehicle), *words, "--force", "--json")

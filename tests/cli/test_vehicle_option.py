@@ -85,12 +85,6 @@ def test_own_system_id(command: Command, put: Put) -> None:
 # All vehicles
 
 
-def test_check_refuses_all(command: Command, put: Put) -> None:
-    url = put(vehicle := px4())
-    assert command("check", url, "--vehicle", "all").code == 2
-    assert not vehicle.requests
-
-
 def test_get_and_fetch_read_every_vehicle(command: Command, put: Put) -> None:
     url = put(Air([px4(table=TABLE | {"OF_PX4": 1.5}), copter()]))
     read = command("get", url, "A", "--vehicle", "all")

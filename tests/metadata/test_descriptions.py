@@ -47,7 +47,7 @@ def test_text_of_a_mask() -> None:
 
 
 def test_names_and_numbers_are_parsed() -> None:
-    assert [MODE.parse(text) for text in ("Loiter", " LOITER ", "5", "0x5", "+5", "005")] == [5] * 6
+    assert [MODE.parse(text) for text in ("Loiter", " LOITER ", "5", "0X5", "+5", "005")] == [5] * 6
     assert [MODE.parse(text) for text in ("land now", "half")] == [9, 0.5]
     assert MODE.parse("-16777217") == -16777217
     assert isinstance(MODE.parse("4"), int)
