@@ -284,8 +284,7 @@ def test_ground_stations_are_shown_with_what_cache_saved(bench: Bench, visit: Ca
 
 
 def test_extended_parameters_are_staged_and_undone(bench: Bench, sight: Sight) -> None:
-    camera = "Camera 4/100, extended"
-    sight.page.get_by_role("navigation").get_by_role("button", name=camera).click()
+    sight.page.get_by_role("navigation").get_by_role("button", name="Camera 4/100, extended").click()
     expect(sight.page.locator("#empty")).to_contain_text("Fetch requests them")
     sight.act("Fetch")
     name = "CAM_NAME"
@@ -318,15 +317,16 @@ def test_on_a_phone_values_are_edited_in_the_sheet(bench: Bench, visit: Callable
     sight.search.fill("MC_YAWRATE_P")
     sight.row("MC_YAWRATE_P").tap()
     expect(sight.details).to_be_visible()
-    field = sight.details.get_by_role("textbox")
-    field.fill("0.3")
+    sight.details.get_by_role("textbox").fill("0.3")
     sight.details.get_by_role("button", name="Stage").tap()
     sight.send()
     expect(sight.dialog).to_contain_text("accepted")
     sight.done()
     assert value_of(bench, "MC_YAWRATE_P") == pytest.approx(0.3)
-    width = sight.page.evaluate("document.documentElement.scrollWidth")
-    assert width <= PHONE["viewport"]["width"]
+    assert sight.page.evaluate("document.documentElement.scrollWidth") <= PHONE["viewport"]["width"]
+    choice = sight.page.locator("#group-choice")
+    whole = "choice => { choice.style.flex = 'none'; choice.length = 1; return choice.offsetWidth }"
+    assert choice.evaluate("choice => choice.offsetWidth") >= choice.evaluate(whole)  # "All groups (903)"
 
 
 def test_without_a_token_one_signs_in(browser: Browser, visit: Callable[..., Sight], tmp_path: Path) -> None:
