@@ -138,7 +138,7 @@ class _Download:
             self.session.report(0, self.table.count)
             self._begins_at = anyio.current_time() if attempt else -math.inf
             if attempt < LIST_REQUESTS_ALONE or attempt % 2 == 0:
-                if self.session.reads_by_index:
+                if self.session.only_by_index:
                     self._reading.add(1)
                     self.channel.send(dialect.request_read(target, 1))
                 return dialect.request_list(target)

@@ -74,7 +74,7 @@ def _reads_by_index(session: Session) -> bool:
     An ArduPilot repeats the index in its answer, which tells that from the acknowledgement of a set.
     """
     is_told = session.identification.is_ardupilot and session.serves_reads.get(int) is not False
-    return session.reads_by_index or (is_told and bool(session.table.is_complete or session.serves_file))
+    return session.only_by_index or (is_told and bool(session.table.is_complete or session.serves_file))
 
 
 async def _read(session: Session, which: str | int, alias: str | int | None = None) -> ReportedValue:
@@ -247,7 +247,7 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
         return control
     await anyio.sleep(session.channel.timing.timeout(0))  # its other answers would be taken for one by name
     by_name = await _try(session, control.param_id)
-    session.reads_by_index = by_name is None
+    session.only_by_index = by_name is None
     return by_name
 
 

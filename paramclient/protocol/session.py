@@ -153,7 +153,7 @@ class Session:
         replaced: by name, the values of an ArduPilot before its last changes.
         contradicted: called when a hash is received that is not the table's.
         serves_reads: whether reads by name (str), and by index (int), are answered, as far as known.
-        reads_by_index: whether reads by index were answered, and reads by name of the same were not.
+        only_by_index: whether reads by index were answered, and reads by name of the same were not.
         listing: the list that is downloaded in place of reads that are not answered.
         seeking: the reads for evidence of the encoding.
         acknowledging: names whose next value may acknowledge a set, in another type than the parameter's.
@@ -186,7 +186,7 @@ class Session:
         self.replaced: dict[str, Replaced] = {}
         self.contradicted: Callable[[], None] = lambda: None
         self.serves_reads: dict[type[str | int], bool] = {}
-        self.reads_by_index = False
+        self.only_by_index = False
         self.listing: Shared[Any] = Shared(spawn, channel.gate)
         self.seeking: Shared[None] = Shared(spawn, channel.gate)
         self.acknowledging: set[str] = set()
