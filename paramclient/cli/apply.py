@@ -27,7 +27,7 @@ from paramclient.cli.sources import described, filled, is_pattern_name, not_a_fi
 from paramclient.files import FileFormat, ParamFile
 from paramclient.model.names import age_in_words, is_pattern
 from paramclient.model.paramset import ParamSet
-from paramclient.provision.apply_restore import OWN_STATE_CATEGORIES, load_restore_point, restore_categories
+from paramclient.provision import apply_restore
 from paramclient.provision.apply_rules import CATEGORIES, READ_ONLY
 from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
 from paramclient.provision.execution import run as run_apply
@@ -210,7 +210,7 @@ async def _earlier_state(moment: float | int | None, session: CommandSession) ->
         if moment is not None:
             read = bind(cache.state_at, *place, moment, extended=extended)
             return State(await anyio.to_thread.run_sync(read), is_restore=True)
-        find = bind(load_restore_point, cache, *place, extended=extended)
+        find = bind(apply_restore.load_restore_point, cache, *place, extended=extended)
         point = await anyio.to_thread.run_sync(find)
     except (errors.CacheError, errors.UnknownVehicle) as error:  # the user named no vehicle of the cache
         end = "; a backup file can be restored without the cache (--no-cache)"
@@ -292,7 +292,7 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
             state, include = await load(session), flags.include
             if state.is_restore:
                 say(f"{session.prefix}the state: {described(state.params)}")
-                include += await restore_categories(session.component, state.params)
+                include += await apply_restore.restore_categories(session.component, state.params)
             info = await known_of_session(session, metadata)
             options = ApplyOptions(include=include, info=info, partial=state.partial, backup=backup)
             options |= {"reboot": flags.reboot, "allow_armed": flags.allow_armed}
@@ -430,14 +430,15 @@ class _Job:
             if left_out := Counter(row.category for row in found.shown_rows if row.category in _INCLUDABLE):
                 counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
                 includes = " ".join(f"--include {category}" for category in left_out)
-                identity, origin = session.component.identity, self.state.params.identity
-                is_own = origin is not None and origin.uid is not None and origin.is_same_vehicle(identity)
-                own = ", ".join(each for each in left_out if is_own and each in OWN_STATE_CATEGORIES)
-                includes += f"; restore writes this vehicle's own {own} too" if own else ""
+                own = ", ".join(each for each in left_out if each in apply_restore.OWN_STATE_CATEGORIES)
+                if own and apply_restore.is_own_state(session.component, self.state.params):
+                    includes += f"; restore writes this vehicle's own {own} too"
                 remarks.append(f"left out: {counts}; to write them: {includes}")
             if late:
                 remarks.append(f"takes effect after a reboot: {listed(late)}")
             remarks.insert(0, "" if self.state.is_restore else made.unchecked_note)
+        lacks = self.state.params.lacks
+        remarks.append(lacks and f"{self.state.params.source} is incomplete: {lacks}")
         for remark in filter(None, remarks):
             say(f"{session.label}: {remark}")
         return code

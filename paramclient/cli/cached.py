@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
 
 from paramclient.cache import CachedSummary, ParamCache, SnapshotSummary
 from paramclient.cache.moments import parse_time
@@ -16,16 +15,13 @@ from paramclient.cli.options import CacheOptions
 from paramclient.cli.output import local_time, print_result, report, report_all, say, show
 from paramclient.cli.session import check_given
 from paramclient.errors import FileError, LinkError, ParamClientError, UsageError
-from paramclient.files.conversion import kind_of
+from paramclient.files.conversion import BEGIN_SIZE, kind_of
 from paramclient.logs.imports import ImportedTable, import_log, import_onboard_log
 from paramclient.logs.onboard import is_onboard_log
 from paramclient.model.identity import autopilot_name
 from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import hash_text, time_or_none
 from paramclient.provision.sources import component_of, tables_in
-
-KIND_BYTES: Final = 4096
-"""Bytes at the beginning of a file that identify its format."""
 
 
 def cache_list(*, options: CacheOptions = CacheOptions()) -> None:
@@ -123,7 +119,7 @@ async def _import(path: Path, cache: ParamCache) -> tuple[ImportedTable, ...]:
         return await import_log(path, cache)
     except LinkError as error:
         with suppress(OSError), path.open("rb") as file:
-            kind = kind_of(file.read(KIND_BYTES)) or "neither a telemetry log (.tlog) nor one of .bin or .ulg"
+            kind = kind_of(file.read(BEGIN_SIZE)) or "neither a telemetry log (.tlog) nor one of .bin or .ulg"
             raise FileError(f"not imported: {kind}", source=str(path)) from error
         raise FileError(str(error).partition(": ")[2]) from error
 

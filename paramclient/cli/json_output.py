@@ -160,6 +160,7 @@ def origin_json(params: ParamSet) -> JsonObject:
         "uid": None if identity is None else identity.uid,
         "at": time_or_none(params.at),
         "count": len(params),
+        **known_members(lacks=params.lacks or None),
     }
 
 

@@ -194,8 +194,8 @@ class SetJob:
         silent = next((each for each in self.errors.values() if not isinstance(each, VehicleError)), None)
         for name, value in self.writes.items():
             error = self.errors.get(name, silent)
-            status = SetStatus.REFUSED if isinstance(error, VehicleError) else SetStatus.NOT_TRIED
-            self.outcomes[name] = SetOutcome(name, value, status if error else SetStatus.UNKNOWN, None, error)
+            failed = SetStatus.REFUSED if isinstance(error, VehicleError) else SetStatus.NOT_TRIED
+            self.outcomes[name] = SetOutcome(name, value, failed if error else SetStatus.UNKNOWN, None, error)
         left = {each.name: each.requested for each in self.outcomes.values() if each.error is None}
 
         def update(outcome: SetOutcome) -> None:

@@ -22,7 +22,7 @@ from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import time_text
 from paramclient.model.paramset import add_defaults
 from paramclient.model.values import check_name
-from paramclient.provision.sources import NO_DEFAULTS, link_of, read_source, resolve, tables_in
+from paramclient.provision.sources import NO_DEFAULTS, choose_names, link_of, read_source, resolve, tables_in
 
 
 async def show(
@@ -60,8 +60,7 @@ async def show(
         check_link(link_of(vehicle))
         found = read_source(vehicle, every=True, extended=extended, incomplete=True, cache=cache)
         sets = [await resolve(vehicle, cache=False)] if found is None else found.sets
-    everything = {name for each in sets for name in each}
-    kept = NameChoice(chosen).choose(everything) if chosen else everything
+    kept = choose_names(chosen, sets)
     views = []
     for whole, known in zip(sets, known_of_sets(sets, options, metadata), strict=True):
         part = part_of(whole, kept)

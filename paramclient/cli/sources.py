@@ -25,7 +25,7 @@ from paramclient.files.formats import address, format_of_name
 from paramclient.links import LinkKind, parse_link
 from paramclient.metadata import Metadata
 from paramclient.model.comparison import compare
-from paramclient.model.names import NameChoice, counted
+from paramclient.model.names import counted
 from paramclient.model.paramset import ParamSet, default_of
 from paramclient.provision import sources
 
@@ -179,13 +179,16 @@ async def save(
         differing = [_differing(*each) for each in zip(sets, known, strict=True)]
         sets, is_part = [each for each in differing if each], is_part or None in differing
     if only and sets:
-        names = NameChoice(only).choose({name for each in sets for name in each})
+        names = sources.choose_names(only, sets)
         sets = [part for each in sets if (part := part_of(each, names))]
     files: dict[str, list[ParamSet]] = {}
     for each in sets:
         kept, left_out = writable(each, written)
         if left_out:
-            report(f"{address(each)}: left out, as only a .json file can hold them: {listed(left_out)}")
+            what = f"left out, as {written} cannot hold them: {listed(left_out)}; json holds most"
+            report(f"{address(each)}: {what}")
+        if each.lacks:
+            report(f"{address(each)} is incomplete: {each.lacks}")
         files.setdefault(filled(str(file), each, address(each)), []).append(kept)
     found: list[JsonObject] = []
     for path, of_file in files.items():
@@ -194,7 +197,6 @@ async def save(
         found.append({"path": path, "format": written.value, "components": members})
         if not options.json:
             contents = [f"{counted(len(each), noun_of(each))} of {address(each)}" for each in of_file]
-            contents = [described(each) for each in of_file] if incomplete else contents
             say(f"{', '.join(contents)} written to {path} ({written})")
     if found and options.json:
         print_json(found[0] if len(found) == 1 else {"files": found})
@@ -316,8 +318,9 @@ def described(params: ParamSet) -> str:
         params.autopilot,
         f"from {params.source}" if params.source else "",
     ]
+    lacks = f" (incomplete: {params.lacks})" if params.lacks else ""
     at = "" if params.at is None else f", {local_time(params.at)}"
-    return " ".join(filter(None, [counted(len(params), noun_of(params)), *origin])) + at
+    return " ".join(filter(None, [counted(len(params), noun_of(params)), *origin])) + at + lacks
 
 
 def is_pattern_name(name: str) -> bool:

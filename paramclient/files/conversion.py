@@ -15,7 +15,7 @@ from paramclient.errors import FileError, PackError, UsageError
 from paramclient.files import json_format, lists
 from paramclient.files.disk import LARGEST_FILE, read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, format_of_name
-from paramclient.files.reading import UTF16_MARKS, Reading
+from paramclient.files.reading import LACKS, UTF16_MARKS, Reading
 from paramclient.model.identity import check_ids, version_text
 from paramclient.model.names import counted, first_of
 from paramclient.model.notation import time_text
@@ -243,7 +243,7 @@ def write_file(
 
 
 def writable(params: ParamSet, file_format: FileFormat) -> tuple[ParamSet, list[str]]:
-    """Return a set without what a format cannot hold, which its source names, and these names.
+    """Return a set without what a format cannot hold, and these names.
 
     If the format can hold none of the parameters, the set is returned unchanged: writing it gives the reason.
     """
@@ -255,15 +255,14 @@ def writable(params: ParamSet, file_format: FileFormat) -> tuple[ParamSet, list[
     left_out = [name for name in params if name not in kept]
     if not left_out or not kept or params.is_extended:
         return params, []
-    source = f"{params.source}, without {first_of(left_out, LEFT_OUT_SHOWN_MAX)}"
-    return replace(params, params=kept, source=source), left_out
+    lacks = f"without {first_of(left_out, LEFT_OUT_SHOWN_MAX)}"
+    return replace(params, params=kept, lacks="; ".join(filter(None, (params.lacks, lacks)))), left_out
 
 
 def _as_file(content: ParamSet | Iterable[ParamSet], file_format: FileFormat) -> ParamFile:
     sets = (content,) if isinstance(content, ParamSet) else tuple(content)
-    if file_format is FileFormat.JSON:
-        return ParamFile(sets, file_format)  # the document has fields for the header's facts
-    return ParamFile(sets, file_format, header=tuple(line for each in sets for line in _header_lines(each)))
+    untold = () if file_format is FileFormat.JSON else sets  # the document has fields for the header's facts
+    return ParamFile(sets, file_format, header=tuple(line for each in untold for line in _header_lines(each)))
 
 
 def _header_lines(params: ParamSet) -> Iterator[str]:
@@ -277,8 +276,7 @@ def _header_lines(params: ParamSet) -> Iterator[str]:
         yield f"of the vehicle {identity.key}{firmware}"
     if params.at is not None:
         yield f"as of {time_text(params.at, 'seconds')}"
-    if params.source:
-        yield f"from {params.source}"
+    yield from (f"{begin}{text}" for begin, text in (("from ", params.source), (LACKS, params.lacks)) if text)
 
 
 def _check(sets: Sequence[ParamSet], file_format: FileFormat) -> None:

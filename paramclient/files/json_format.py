@@ -37,10 +37,10 @@ from paramclient.model.values import (
     ParamType,
     Value,
     bits_of,
-    check_ext_value,
     check_name,
     from_bits,
     is_portable_name,
+    parse_ext_value,
 )
 
 FAULT_LENGTH_MAX: Final = 300
@@ -203,8 +203,8 @@ def _set(reading: Reading, content: object, place: Place) -> ParamSet:
     if "identity" in found:
         known = _checked(reading, found["identity"], (*place, "identity"), _IDENTITY, _IDS)
         identity = Identity(**known) if known.keys() >= _IDS else None
-    ids = found.get("component"), found.get("system")
-    return ParamSet(params, *ids, identity, found.get("at"), reading.source, is_extended)
+    (*ids, when), lacks = map(found.get, ("component", "system", "at")), found.get("lacks", "")
+    return ParamSet(params, *ids, identity, when, reading.source, is_extended, lacks)
 
 
 def _param(name: str, found: Mapping[str, Any], *, is_extended: bool) -> WrittenParam:
@@ -281,11 +281,7 @@ def _number(content: object) -> Value:
 
 def _custom(content: object) -> Value:
     """Return a CUSTOM value: text, or bytes after `hex:`."""
-    text = _text(content)
-    try:
-        value = check_ext_value(bytes.fromhex(text.removeprefix(HEX)) if text.startswith(HEX) else text)
-    except ValueError as error:  # also a UsageError
-        raise UsageError(str(error)) from None
+    value = parse_ext_value("value", _text(content), _CUSTOM)
     return from_bits(bits_of(value, _CUSTOM), _CUSTOM)
 
 
@@ -313,6 +309,7 @@ _SET: Final[Checks] = {
     "identity": _object,
     "at": _time,
     "source": _text,
+    "lacks": _text,
     "params": _object,
 }
 _IDENTITY: Final[Checks] = {
@@ -351,6 +348,7 @@ def _set_fields(params: ParamSet) -> dict[str, object]:
             "extended": params.is_extended or None,
             "at": None if params.at is None else time_text(params.at, "auto"),
             "source": _encodable(params.source) or None,
+            "lacks": _encodable(params.lacks) or None,
             "identity": None if params.identity is None else asdict(params.identity),
             "params": {param.name: json_fields(params, param) for param in params.values()},
         }

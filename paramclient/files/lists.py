@@ -141,8 +141,7 @@ class _Pairs:
         try:
             self._read_included(path, source, chain)
         except UsageError as error:
-            expected = f"@include with a file that can be read ({error})"
-            self._reading.bad_line(line, expected, source, is_row=False)
+            self._reading.bad_line(line, f"@include with a readable file ({error})", source, is_row=False)
             return
         if self._reading.fault_count > before and not self._reading.partial:
             self._reading.fault(line.number, "includes that file", source=source)

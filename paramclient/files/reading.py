@@ -7,12 +7,13 @@ import math
 import re
 import struct
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import cached_property
 from typing import Final, NamedTuple
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.formats import FileFormat, ParamFile
-from paramclient.model.names import first_of
+from paramclient.model.names import counted, first_of
 from paramclient.model.notation import value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, bits_of, check_portable_name, format_value, from_bits
@@ -23,6 +24,8 @@ EXCERPT_LENGTH_MAX: Final = 80
 """Characters of a bad line that an error shows, so that the error stays readable."""
 NUMBER_LENGTH_MAX: Final = 400
 """Characters of a number: the longest decimal form of a double without padding has fewer."""
+LACKS: Final = "incomplete: "
+"""Begins the line in the header of a list that has `ParamSet.lacks`."""
 UTF16_MARKS: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 """The byte order marks with which a text in UTF-16 begins."""
 
@@ -160,6 +163,9 @@ class Reading:
         if not any(sets):
             raise FileError("the file contains no parameters", source=self.source)
         self.notes += [f"{each}; left out." for each in told]
+        known = [line.removeprefix(LACKS) for line in header if line.startswith(LACKS)]
+        known += [f"without {counted(len(told), 'line')} that cannot be read"] if told else []
+        sets = tuple(replace(each, lacks="; ".join(filter(None, (each.lacks, *known)))) for each in sets)
         if (more := self._repeated - FAULTS_MAX) > 0:
             self.notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")
         if self.foreign:

@@ -127,6 +127,7 @@ class ParamSet(ByName[WrittenParam]):
         at: when the values were observed, as a Unix time in seconds, or None if unknown.
         source: the source, for messages: a file's name, `link udpin:…`, `cache uid:…`.
         is_extended: whether these are extended parameters.
+        lacks: what is missing of an incomplete table, in words; "" if nothing is known to be.
     """
 
     params: Mapping[str, WrittenParam]
@@ -136,6 +137,7 @@ class ParamSet(ByName[WrittenParam]):
     at: float | None
     source: str
     is_extended: bool
+    lacks: str
 
     def __init__(
         self,
@@ -146,9 +148,10 @@ class ParamSet(ByName[WrittenParam]):
         at: float | None = None,
         source: str = "",
         is_extended: bool = False,
+        lacks: str = "",
     ) -> None:
         written = {name: _written(name, value, is_extended) for name, value in params.items()}
-        given = (written, component, system, identity, at, source, is_extended)
+        given = (written, component, system, identity, at, source, is_extended, lacks)
         for attribute, content in zip(fields(self), given, strict=True):
             object.__setattr__(self, attribute.name, content)
 

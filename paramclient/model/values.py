@@ -245,13 +245,13 @@ def check_portable_name(name: str) -> str:
     """Check and return a parameter name.
 
     Raises:
-        UsageError: the name is not a valid param_id, or no parameter file can hold it. The client ignores
-            such names when a vehicle sends them.
+        UsageError: the name is not a valid param_id, or not every format of file can hold it. The client
+            ignores such names when a vehicle sends them.
     """
     if not is_portable_name(check_name(name)):
         raise UsageError(
-            f"parameter name {name!r}: no parameter file can hold it; a name has a letter, no space and none"
-            " of # , ; = ; it begins with neither @ nor / and does not end with :"
+            f"parameter name {name!r}: not every parameter file can hold it; a name has a letter, no space,"
+            " none of # , ; = ; it begins with neither @ nor / and does not end with :"
         )
     return name
 

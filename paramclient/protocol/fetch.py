@@ -29,7 +29,7 @@ IDENTITY_TIME: Final = 1.5
 ROUNDS_MAX: Final = 3
 """Downloads, while the table changes during them."""
 NOT_REFRESHED: Final = "The values outside the hash were not read again, because the policy is hash-only."
-LEFT_OUT: Final = "Skipped {}: no parameter file can contain this name."
+LEFT_OUT: Final = "Skipped {}: not every parameter file can hold this name."
 NOT_READ: Final = "Values outside the vehicle's hash could not be read: {}."
 CHANGED: Final = "Changed since they were cached: {}."
 SHOWN_MAX: Final = 5

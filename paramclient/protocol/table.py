@@ -69,7 +69,7 @@ class Table:
         is_exact: whether every integer is exact: read from a file, or small enough for float32.
         volatile: names outside the vehicle's hash, as far as known.
         author_of: returns the author of a change of a name.
-        left_out: received names that no parameter file can contain, and that are not stored.
+        left_out: received names that not every parameter file can hold, and that are not stored.
         evidence: for each encoding, a value that shows it: name, bytes and type.
         is_growing: whether each value so far was the last one by its own param_count, or some were beyond it:
             the count grows with the values that arrive, and only a pause tells the end of the list.

@@ -84,6 +84,12 @@ async def restore(component: Component, state: Wanted, **options: Unpack[ApplyOp
     return await run(component, state, options, is_restore=True)
 
 
+def is_own_state(component: Component, state: ParamSet) -> bool:
+    """Return whether a state is one of this very vehicle: `restore` then includes `OWN_STATE_CATEGORIES`."""
+    origin, own = state.identity, component.identity
+    return origin is not None and origin.uid == own.uid and origin.is_same_vehicle(own)
+
+
 async def restore_categories(component: Component, state: ParamSet) -> tuple[str, ...]:
     """Return the categories that `restore` includes for this state.
 
@@ -94,10 +100,9 @@ async def restore_categories(component: Component, state: ParamSet) -> tuple[str
     """
     await wait_for_identity(component)
     origin, own = state.identity, component.identity
-    is_own = origin is not None and origin.uid == own.uid and origin.is_same_vehicle(own)
-    if origin is not None and not is_own and None not in (origin.uid, own.uid) and origin.uid != own.uid:
+    if origin is not None and None not in (origin.uid, own.uid) and origin.uid != own.uid:
         raise UsageError(f"the state is that of another vehicle: {origin}; this vehicle is {own}")
-    return OWN_STATE_CATEGORIES if is_own else (OUT_OF_RANGE,)
+    return OWN_STATE_CATEGORIES if is_own_state(component, state) else (OUT_OF_RANGE,)
 
 
 def load_restore_point(

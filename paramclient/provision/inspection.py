@@ -181,7 +181,7 @@ async def reread(
     params = (param for name, param in component.params.items() if name in known)
     return replace(
         inspection,
-        table=component_set(component, params, inspection.table.source),
+        table=component_set(component, params, inspection.table.source, inspection.table.lacks),
         absent=(inspection.absent | unknown).difference(found),
     )
 

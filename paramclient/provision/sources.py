@@ -24,7 +24,7 @@ from paramclient.files.formats import AUTOPILOT
 from paramclient.links import ReplayLink
 from paramclient.logs.onboard import is_onboard_log, read_onboard_log
 from paramclient.model.comparison import defaults_of, non_defaults
-from paramclient.model.names import first_of
+from paramclient.model.names import NameChoice, first_of
 from paramclient.model.paramset import ParamSet, add_defaults
 from paramclient.model.values import Param
 from paramclient.protocol.fetch import FetchResult
@@ -98,7 +98,7 @@ def read_source(
     Args:
         text, component, extended, cache: as in `resolve`; `component` selects only a table of the cache.
         every: all tables of a vehicle of the cache, instead of that of its autopilot.
-        incomplete: also an incomplete table of the cache, whose source says so.
+        incomplete: also an incomplete table of the cache.
         partial: leave out the lines of a file that cannot be read, with a warning for each.
 
     Raises:
@@ -167,11 +167,26 @@ def _exists(text: str) -> bool:
 def choose(file: ParamFile, component: int | None, system: int | None) -> ParamSet:
     """Return a file's parameters for a component; `system` selects only in a file of several systems.
 
+    Parameters without ids get these.
+
     Raises:
         FileError: the file has no parameters for it.
     """
     is_of_several = len({each.system for each in file.sets}) > 1
-    return file.choose(component, system=system if is_of_several else None)
+    found = file.choose(component, system=system if is_of_several else None)
+    component = component if found.component is None else found.component
+    return replace(found, system=found.system or system, component=component)
+
+
+def choose_names(patterns: Collection[str], sets: Iterable[ParamSet]) -> set[str]:
+    """Return the names in sets that names and patterns choose; without any, all names.
+
+    Raises:
+        UsageError: one matches no name; the error says which sets are incomplete.
+    """
+    known = {name for each in sets for name in each}
+    of = "".join(f" of {each.source} ({each.lacks})" for each in sets if each.lacks)
+    return NameChoice(patterns).choose(known, of) if patterns else known
 
 
 def tables_in(
@@ -203,10 +218,8 @@ def tables_in(
         raise NotInCache("there are no extended parameters of that vehicle in the cache")
     if not chosen:
         addresses = [f"{each.system}/{each.component} ({each.key})" for each in known]
-        raise UnknownVehicle(
-            f"component {component} is not in the cache {cache.place}, which has {', '.join(addresses)}",
-            vehicles=addresses,
-        )
+        what = f"component {component} is not in the cache {cache.place}, which has {', '.join(addresses)}"
+        raise UnknownVehicle(what, vehicles=addresses)
     return chosen
 
 
@@ -216,10 +229,10 @@ def component_of(vehicle: str) -> int | None:
     return None if address is None else address[1]
 
 
-def component_set(component: Component, params: Iterable[Param], source: str) -> ParamSet:
+def component_set(component: Component, params: Iterable[Param], source: str, lacks: str = "") -> ParamSet:
     """Return parameters of a component as a set of this moment, or of that of the log on the link.
 
-    `source` is their origin in words.
+    `source` and `lacks` are as in `ParamSet`.
     """
     link = component.core.link
     return ParamSet(
@@ -230,6 +243,7 @@ def component_set(component: Component, params: Iterable[Param], source: str) ->
         at=link.at if isinstance(link, ReplayLink) else time.time(),
         source=source,
         is_extended=component.is_extended,
+        lacks=lacks,
     )
 
 
@@ -239,8 +253,7 @@ def fetched_set(component: Component, result: FetchResult, *, source: str, parti
     Args:
         component: the component.
         result: the result of its fetch.
-        source: the origin of the set, in words; a doubt of the encoding, and with `partial` the missing
-            parameters, are added.
+        source: the origin of the set, in words; a doubt of the encoding is added.
         partial: whether some parameters may be missing.
 
     Raises:
@@ -252,23 +265,22 @@ def fetched_set(component: Component, result: FetchResult, *, source: str, parti
     indices = sorted({*result.missing, *(index for index in cached if index is not None)})
     missing = [cached.get(index, f"index {index}") for index in indices]
     if missing and not partial:
-        vehicle = f"{component.system}/{component.component} {component.autopilot}"
-        was = f"{first_of(missing, NAMES_SHOWN_MAX)} {'was' if len(missing) == 1 else 'were'} not received"
-        raise VehicleError(
-            f"{vehicle} on {component.identity.link} is incomplete: {was}",
-            system=component.system,
-            component=component.component,
+        vehicle = (
+            f"{component.system}/{component.component} {component.autopilot} on {component.identity.link}"
         )
+        was = f"{first_of(missing, NAMES_SHOWN_MAX)} {'was' if len(missing) == 1 else 'were'} not received"
+        raise VehicleError(f"{vehicle} is incomplete: {was}", component.system, component.component)
     known = [name for name in result.params if name not in result.cached]
     return part_set(component, [result.params[name] for name in known], source, missing)
 
 
 def part_set(component: Component, params: Collection[Param], source: str, lacks: Iterable[str]) -> ParamSet:
-    """Return a set whose origin says what it lacks: these parameters, and names that no file can hold."""
+    """Return a set that lacks these parameters, and those with a name that the client does not store."""
+    words = ""
     if names := [*lacks, *map(repr, sorted(component.session.table.left_out))]:
         kept = sum(param.index is not None for param in params)
-        source += f": {kept} of {component.count} parameters, without {first_of(names, NAMES_SHOWN_MAX)}"
-    return component_set(component, params, source)
+        words = f"{kept} of {component.count} parameters, without {first_of(names, NAMES_SHOWN_MAX)}"
+    return component_set(component, params, source, words)
 
 
 def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> ParamSet:
@@ -277,25 +289,17 @@ def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> Par
     Raises:
         VehicleError: the cache has not all of them, and `partial` is false.
     """
-    source = f"cache {table.key}"
+    lacks = ""
     if not table.complete:
         of = "" if table.count is None else f" of {table.count}"
         others = sum(param.index is None for param in table.params.values()) if of else 0
-        are = f"{table.size - others}{of} parameters are in the cache"
-        are += f", and {others} read by name" if others else ""
-        source = f"{source}: {are}"
+        lacks = f"{table.size - others}{of} parameters are in the cache"
+        lacks += f", and {others} read by name" if others else ""
         if not partial:
-            message = f"{table.system}/{table.component} is incomplete: {are}"
+            message = f"{table.system}/{table.component} is incomplete: {lacks}"
             raise VehicleError(message, system=table.system, component=table.component)
-    return ParamSet(
-        table.params,
-        component=table.component,
-        system=table.system,
-        identity=table.identity,
-        at=table.updated_at if table.synced_at is None else table.synced_at,
-        source=source,
-        is_extended=extended,
-    )
+    at, source = table.updated_at if table.synced_at is None else table.synced_at, f"cache {table.key}"
+    return ParamSet(table.params, table.component, table.system, table.identity, at, source, extended, lacks)
 
 
 def select_non_defaults(whole: ParamSet, described: Mapping[str, int | float]) -> ParamSet:

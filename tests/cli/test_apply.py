@@ -210,7 +210,7 @@ def test_the_backup_of_an_incomplete_table_names_what_it_lacks(
 ) -> None:
     vehicle, backup = Partial({"A": (1, ParamType.INT32)}, count=lambda index: 2), tmp_path / "b.param"
     assert command("apply", put(vehicle), file("A,2\n"), "--backup", backup).code == 0
-    assert "# from vehicle 1/1: 1 of 2 parameters, without index 1\nA,1\n" in backup.read_text()
+    assert "vehicle 1/1\n# incomplete: 1 of 2 parameters, without index 1\nA,1\n" in backup.read_text()
 
 
 # restore

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from paramclient import ParamCache, ParamSet, ParamType, read_file, write_file
+from paramclient import ParamCache, ParamSet, ParamType, WrittenParam, read_file, write_file
+from paramclient.files.formats import ENDINGS
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from tests.commands import Command, Put
 from tests.conversations.partial import TABLE, Partial
@@ -77,6 +78,10 @@ def test_what_was_received_is_written_with_incomplete_and_the_file_names_the_oth
         assert set(read_file(path).choose()) == set(TABLE) - ({"NODE_ID"} if ending == "pck" else set())
         lacks = f"8 of 10 parameters{', without index 9, ' if where != '1' else ' are in the cache'}"
         assert (lacks in saved.err, lacks.encode() in path.read_bytes()) == (True, ending != "pck")
+        assert lacks in command("save", where, path, "--incomplete", "--only", "ZZ*").err
+        again = tmp_path / "again.json"
+        for words in (["save", path, again], ["show", again], ["diff", again, again], ["apply", URL, again]):
+            assert lacks in command(*words).err or ending == "pck"
         path.unlink()
 
 
@@ -99,13 +104,16 @@ def test_what_a_format_cannot_hold_is_left_out_and_named(
     assert saved.code == 0
     is_whole = ending == "json"
     assert set(read_file(path).choose()) == ({*TABLE, *raw} if is_whole else {*TABLE})
-    left_out = "1/1: left out, as only a .json file can hold them: WIDE, ODD"
+    left_out = f"1/1: left out, as {ENDINGS[f'.{ending}']} cannot hold them: WIDE, ODD; json holds most"
     assert (left_out in saved.err, "without WIDE, ODD" in path.read_text()) == (not is_whole, not is_whole)
     if ending == "param":
         write_file(spaced, ParamSet({"A": 1, "A B": 2}, 1, 1))
         saved = command("save", spaced, path)
-        assert (saved.code, "can hold them: A B" in saved.err) == (0, True)
+        assert (saved.code, "left out, as mission-planner cannot hold them: A B" in saved.err) == (0, True)
         assert "line 9: the client ignores a parameter called 'A B'" in saved.err
+        write_file(spaced, ParamSet({"A": WrittenParam("A", 1, ParamType.INT8)}))
+        assert command("save", spaced, tmp_path / "ids.params", "--vehicle", 3).code == 0
+        assert read_file(tmp_path / "ids.params").choose().system == 3
 
 
 def test_a_vehicle_with_component_0_is_written_and_read(command: Command, put: Put, tmp_path: Path) -> None:

@@ -256,6 +256,7 @@ def test_an_incomplete_packed_file_has_a_note() -> None:
         b"A,1\rB,0X1f\r",
         b"A 1 @READONLY\nB +31e0",
         b"A 1\nA 1.0\nB 31\n",
+        b"A,1\n# \x00\nB,31 # \x07\n",
     ],
 )
 def test_variants_of_a_list_are_parsed(data: bytes) -> None:
@@ -293,10 +294,8 @@ def test_the_last_value_of_a_repeated_name_is_used(text: str, value: float, note
     ("text", "problem"),
     [
         ("A,1,5", "expected NAME,VALUE with a decimal point (1.5, not 1,5) and no third column, found"),
-        ("A 1,5", "with a decimal point"),
         ("A 1.5 m/s", "and nothing after it (no unit, no further column)"),
         ("A", "expected NAME VALUE, found 'A'"),
-        ("A;5", "expected"),
         ("A \uff11", "with a number"),
         ("A 1e999", "with a number"),
         ("A -0x10", "with a number"),
@@ -306,7 +305,6 @@ def test_the_last_value_of_a_repeated_name_is_used(text: str, value: float, note
         ("A_VERY_LONG_NAME_ 2", "a param_id holds 16"),
         ("@include other.parm", "only a file on disk can include another file"),
         ("@delete A", "an unknown instruction for ArduPilot's tools"),
-        ("hello world", "with a number"),
     ],
 )
 def test_ambiguous_lines_are_rejected(text: str, problem: str) -> None:
@@ -413,10 +411,6 @@ def test_a_comment_in_another_encoding_is_read() -> None:
     assert "Windows-1252: line 1." in file.notes[1]
 
 
-def test_a_control_character_in_a_comment_is_no_fault() -> None:
-    assert [*loads(b"A,1\n# \x00\nB,2 # \x07\n", source="quad.param").choose()] == ["A", "B"]
-
-
 ROWS = {
     "A,1\n?\nB,2\n": [*(f"{name},0" for name in BAD_NAMES), "C,one", "C", "C,1,5", "C,1e999", "C,1 m"],
     "1\t1\tA\t1\t6\n1\t1\t?\n1\t1\tB\t2\t6\n": [*(f"{name}\t0\t6" for name in BAD_NAMES), "C\t1e39\t9", "C"],
@@ -484,8 +478,12 @@ CAMERA = params_of(WrittenParam("A", 1, ParamType.INT8), component=100)
         ([params_of(WrittenParam("A", 1))], "qgc", "A has no type that MAVLink defines"),
         ([replace(CAMERA, system=None)], "qgc", "the set has none: give it one"),
         ([params_of(WrittenParam("A", 1))], "pck", "A has no type, and a packed file holds INT8, INT16"),
-        ([params_of(WrittenParam("A B", 1))], "parm", "'A B': no parameter file can hold it"),
-        ([params_of(WrittenParam("A#", 1, ParamType.INT8))], "qgc", "'A#': no parameter file can hold it"),
+        ([params_of(WrittenParam("A B", 1))], "parm", "'A B': not every parameter file can hold it"),
+        (
+            [params_of(WrittenParam("A#", 1, ParamType.INT8))],
+            "qgc",
+            "'A#': not every parameter file can hold it",
+        ),
         ([params_of(WrittenParam("A", 300, ParamType.INT8))], "json", "300 does not fit INT8"),
         (
             [params_of(WrittenParam("A", from_bits(0x7FC12345, ParamType.REAL32)))],
