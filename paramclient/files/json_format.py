@@ -203,8 +203,8 @@ def _set(reading: Reading, content: object, place: Place) -> ParamSet:
     if "identity" in found:
         known = _checked(reading, found["identity"], (*place, "identity"), _IDENTITY, _IDS)
         identity = Identity(**known) if known.keys() >= _IDS else None
-    (*ids, when), lacks = map(found.get, ("component", "system", "at")), found.get("lacks", "")
-    return ParamSet(params, *ids, identity, when, reading.source, is_extended, lacks)
+    ids, lacks = (found.get("component"), found.get("system")), found.get("lacks", "")
+    return ParamSet(params, *ids, identity, found.get("at"), reading.source, is_extended, lacks)
 
 
 def _param(name: str, found: Mapping[str, Any], *, is_extended: bool) -> WrittenParam:
