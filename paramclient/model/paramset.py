@@ -20,6 +20,7 @@ from paramclient.model.values import (
     bits_of,
     byte_length,
     check_ext_value,
+    check_name,
     check_value,
     format_value,
     from_bits,
@@ -109,7 +110,7 @@ def _written(name: str, given: WrittenParam | Param | Settable, is_extended: boo
     value = check_ext_value(given) if is_extended else check_value(given)
     is_raw = isinstance(value, bytes) and len(value) == WIRE_SIZE
     is_custom = isinstance(value, bytes | str) and not is_raw
-    return WrittenParam(name, value, ParamType.CUSTOM if is_custom else None)
+    return WrittenParam(check_name(name), value, ParamType.CUSTOM if is_custom else None)
 
 
 @dataclass(frozen=True, slots=True, init=False)
@@ -128,6 +129,9 @@ class ParamSet(ByName[WrittenParam]):
         source: the source, for messages: a file's name, `link udpin:…`, `cache uid:…`.
         is_extended: whether these are extended parameters.
         lacks: what is missing of an incomplete table, in words; "" if nothing is known to be.
+
+    Raises:
+        UsageError: a plain value, or its name, is not valid.
     """
 
     params: Mapping[str, WrittenParam]

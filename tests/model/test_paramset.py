@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
+from paramclient.errors import UsageError
 from paramclient.model.paramset import (
     Default,
     DefaultSource,
@@ -17,13 +20,15 @@ from paramclient.model.paramset import (
 from paramclient.model.values import Param, ParamType, Value, bits_of
 
 
-def param(
-    name: str,
-    value: Value,
-    kind: ParamType | int = ParamType.REAL32,
-    default: int | float | None = None,
-) -> Param:
+def param(name: str, value: Value, kind: int = ParamType.REAL32, default: Value | None = None) -> Param:
     return Param(name, value, kind, 0, bits_of(value, kind), default=default)
+
+
+def test_plain_values_have_names_that_a_parameter_can_have() -> None:
+    names: tuple[Any, ...] = (1, None, "", "SEVENTEEN_LETTERS", "ÄÖÜ")
+    for name in names:
+        with pytest.raises(UsageError, match="parameter name"):
+            ParamSet({"A": 1, name: 1})
 
 
 @pytest.mark.parametrize(
@@ -96,7 +101,5 @@ def test_changed_returns_values_that_differ_from_defaults() -> None:
         ("NOW_NAN", nan, 1.0, True),
     )
     table = {name: Param(name, value, 9, 0, 0, default=default) for name, value, default, _ in rows}
-    assert {name: param.is_changed for name, param in table.items()} == {
-        name: is_changed for name, _, _, is_changed in rows
-    }
+    assert [table[name].is_changed for name, *_ in rows] == [is_changed for *_, is_changed in rows]
     assert [*ParamMap(table).changed()] == ["OTHER", "NOW_NAN"]

@@ -88,7 +88,7 @@ LEFT_OUT = {
             *("COMPASS_OFS2_X", "INS_ACC2OFFS_Y", "AHRS_TRIM_X", "INS4_ACCOFFS_X", "INS_TCAL1_TMAX"),
             "COMPASS_MOTCT",  # says by what the vehicle's COMPASS_MOT_? are multiplied
         ],
-        "measured": ["INS_GYROFFS_Z", "INS4_GYR2_CALTEMP", "ARSPD_OFFSET", "COMPASS_DEC"],
+        "measured": ["INS_GYROFFS_Z", "INS4_GYR_CALTEMP", "ARSPD_OFFSET", "COMPASS_DEC"],
         "counter": ["STAT_RESET", "MIS_TOTAL"],
     },
     "px4": {
