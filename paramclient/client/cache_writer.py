@@ -71,8 +71,8 @@ class TableRecord:
 class CacheWriter:
     """Writes the tables of one client to its cache, and loads cached tables of new components.
 
-    A cache error causes one warning in the log until the next successful write; the program goes on, and
-    values that could not be written are written later.
+    The program goes on after a cache error, and values that could not be written are written later. The log
+    has one warning until the next successful write, unless a call that needs the cache fails before it.
 
     Args:
         cache: the cache, or None.
@@ -92,7 +92,7 @@ class CacheWriter:
         self._vehicles: dict[Node, Node] = {}  # the autopilot with this identity
         self._records: dict[Session, TableRecord] = {}
         self._writing = anyio.Lock()
-        self._is_closing = False
+        self._is_told = False  # the user knows of the failure
         self._has_written = False  # so the cache is one that can be written
         self._is_synced = True  # what was written is safe from power loss
         self._something_to_write = anyio.Event()
@@ -104,7 +104,7 @@ class CacheWriter:
         """Load the list of cached components."""
         if self.cache is not None:
             with suppress(CacheError):
-                found = await self._call(self.cache.components)
+                found = await self.call(self.cache.components, is_told=False)
                 self._known = {(which, each.component) for each in found for which in (each.system, each.key)}
 
     async def close(self, nodes: Collection[Node]) -> None:
@@ -117,7 +117,7 @@ class CacheWriter:
         if self.cache is None:
             return
         is_written = False
-        was_warned, self._is_closing = self.failure is not None, True
+        was_told, self._is_told = self._is_told, True
         with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
             for node in nodes:
                 is_known = node.identification.is_settled
@@ -130,7 +130,7 @@ class CacheWriter:
                     await self.write_all()  # after a replaced file
                     is_written = True
                     break
-        lost = () if is_written or was_warned else self._identities.items()
+        lost = () if is_written or was_told else self._identities.items()
         for node, identity in lost:
             if any(self._record(node, session).is_unwritten for session in node.sessions):
                 logger.warning(
@@ -169,9 +169,9 @@ class CacheWriter:
             is_extended = session is node.extended
             cached = None
             with suppress(CacheError):
-                cached = await self._call(
-                    partial(self.cache.load, identity.key, node.component, extended=is_extended)
-                )
+                load = partial(self.cache.load, identity.key, node.component, extended=is_extended)
+                cached = await self.call(load, is_told=False)
+            self._tell()
             if vehicle.identification.identity.key != identity.key:
                 return  # another vehicle has taken the address meanwhile, and its table is loaded
             if identity.uid is not None:
@@ -242,16 +242,18 @@ class CacheWriter:
             await anyio.sleep(FLUSH_INTERVAL / 2)
             self._something_to_write = anyio.Event()
             try:
-                await self.write_all()
+                await self.write_all(is_told=False)
             except CacheError:
                 await anyio.sleep(RETRY_INTERVAL)
+                self._tell()
                 self._something_to_write.set()
 
-    async def write_all(self, *, durable: bool = False) -> None:
+    async def write_all(self, *, durable: bool = False, is_told: bool = True) -> None:
         """Write all received values now. Cancellation loses no value.
 
         Args:
             durable: whether to wait until they are safe from power loss.
+            is_told: as for `call`.
 
         Raises:
             CacheError: the write failed. The values stay in memory and are written later.
@@ -270,7 +272,7 @@ class CacheWriter:
                 record.is_whole = False
             self._is_synced = False
             try:
-                await self._call(partial(self.cache.save, updates, durable=durable))
+                await self.call(partial(self.cache.save, updates, durable=durable), is_told=is_told)
             except BaseException:
                 for record, _, was_whole, _ in before:
                     record.is_whole |= was_whole
@@ -279,7 +281,7 @@ class CacheWriter:
                 del record.changes[:count]
             self._has_written = True
             self._is_synced = durable
-            self.failure = None
+            self.failure, self._is_told = None, False
             if self.cache.replacements != self._replacements:  # a new file, without the earlier values
                 self._replacements = self.cache.replacements
                 for _, _, record in records:
@@ -337,8 +339,12 @@ class CacheWriter:
         """Run a blocking call in the cache's thread after earlier calls. Cancellation does not stop it."""
         return await anyio.to_thread.run_sync(work, abandon_on_cancel=True, limiter=self._thread)
 
-    async def _call(self, work: Callable[[], T]) -> T:
-        """Run a cache call in the thread, with one warning in the log for several failures.
+    async def call(self, work: Callable[[], T], *, is_told: bool = True) -> T:
+        """Run a cache call in the thread.
+
+        Args:
+            work: the call.
+            is_told: whether the caller passes its error on to the user.
 
         Raises:
             CacheError: it failed.
@@ -346,10 +352,15 @@ class CacheWriter:
         try:
             return await self.run_in_thread(work)
         except (CacheError, UsageError) as error:  # UsageError: the clock has an impossible time
-            if self.failure is None and not self._is_closing:
-                logger.warning("continuing without the cache: %s", error)
             self.failure = error
+            self._is_told |= is_told
             raise CacheError(str(error)) from error
+
+    def _tell(self) -> None:
+        """Log a failure once, unless a call has raised it, or `close` logs what is lost."""
+        if self.failure is not None and not self._is_told:
+            self._is_told = True
+            logger.warning("continuing without the cache: %s", self.failure)
 
 
 def update_of(

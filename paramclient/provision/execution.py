@@ -235,7 +235,7 @@ class _Run:
         try:
             # the history then has the values from before the change
             await writer.write_all()
-            snapshot = await writer.run_in_thread(
+            snapshot = await writer.call(
                 lambda: cache.store_snapshot(
                     component.identity,
                     component.component,

@@ -20,9 +20,7 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request
 from fastapi.responses import PlainTextResponse, Response
 from fastapi.security import HTTPBearer
 from fastapi.sse import EventSourceResponse, ServerSentEvent
-from pydantic import AwareDatetime, BaseModel, BeforeValidator, Field, model_validator
-from pydantic import StrictFloat as Real
-from pydantic import StrictInt as Whole
+from pydantic import AwareDatetime, BaseModel, BeforeValidator, Field, StrictFloat, StrictInt, model_validator
 
 from paramclient.cache import ParamCache
 from paramclient.cli import json_output
@@ -84,7 +82,7 @@ def _parse_moment(given: object) -> object:
 
 Name = Annotated[str, Field(min_length=1, max_length=16)]
 Value = Annotated[
-    Whole | Annotated[Real, Field(allow_inf_nan=False)] | Annotated[str, Field(max_length=400)],
+    StrictInt | Annotated[StrictFloat, Field(allow_inf_nan=False)] | Annotated[str, Field(max_length=400)],
     Field(
         description='A number, also as text such as "NaN", or the name of a value in the metadata; of an '
         "extended parameter also text, or bytes as hex:00ff."
@@ -95,7 +93,7 @@ Seconds = Annotated[float | None, Field(gt=0, le=86_400, description="Timeout in
 Pattern = Annotated[str, Field(min_length=1, max_length=64)]
 Patterns = Annotated[tuple[Pattern, ...], Field(max_length=VALUES_MAX)]
 Moment = Annotated[
-    Annotated[Whole, Field(ge=1, lt=1 << 62)] | Annotated[AwareDatetime, Field(strict=True)],
+    Annotated[StrictInt, Field(ge=1, lt=1 << 62)] | Annotated[AwareDatetime, Field(strict=True)],
     BeforeValidator(_parse_moment),
     Field(description="The number of a snapshot, or a time with its zone."),
 ]

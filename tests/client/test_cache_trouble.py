@@ -130,9 +130,10 @@ async def test_after_many_changes_the_whole_table_is_written(
             assert cache.component().complete
 
 
+@pytest.mark.parametrize("is_told", [False, True])
 @UNWRITABLE
-async def test_an_end_says_what_is_lost(
-    unwritable: Holding, path: Path, caplog: pytest.LogCaptureFixture
+async def test_an_end_says_what_is_lost_unless_an_error_said_why(
+    unwritable: Holding, is_told: bool, path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with ExitStack() as held:
         async with fetched(small_px4(), cache=path) as (_, component):
@@ -140,8 +141,12 @@ async def test_an_end_says_what_is_lost(
             key = component.identity.key
             held.enter_context(unwritable(path))
             await component.set(NAME, 5.0)
-        [lost] = warnings(caplog)
-    assert lost.startswith(f"the last values of 1/1 ({key}) are not in the cache, and lost: ")
+            if is_told:
+                await anyio.sleep(1.0)  # a write fails meanwhile
+                with pytest.raises(CacheError, match="nothing was sent"):
+                    await apply(component, {NAME: 6.0})
+        lost = [each.partition(", and lost: ")[0] for each in warnings(caplog)]
+    assert lost == [f"the last values of 1/1 ({key}) are not in the cache"] * (not is_told)
 
 
 async def test_a_client_that_ends_waits_for_the_cache(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -270,8 +275,7 @@ async def test_a_clock_that_cannot_be_costs_a_warning_and_nothing_is_lost(
     vehicle, right = small_px4(), time_of_day()
     async with ParamClient(vehicle, cache=path) as client:
         set_clock(wrong)
-        component = await client.component()
-        assert (await component.fetch_all()).complete
+        assert (await (await client.component()).fetch_all()).complete
         await anyio.sleep(1.0)
         set_clock(right)
         await anyio.sleep(cache_writer.RETRY_INTERVAL + 1.0)

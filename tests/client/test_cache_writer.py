@@ -80,8 +80,7 @@ def trusts(component: Component, names: Collection[str] | None = None) -> set[Tr
 async def test_an_unchanged_vehicle_is_not_downloaded_again(path: Path) -> None:
     vehicle = PX4Vehicle()
     volatile = {each.name for each in vehicle.entries if each.row.volatile and each.name in vehicle.params}
-    first = await session(vehicle, path)
-    assert first.source == "stream"
+    assert (await session(vehicle, path)).source == "stream"
     proven_at = table_in(path).synced_at
     tap = Tap(vehicle)
     async with ParamClient(Air.symmetric([tap], delay=0.1), cache=path) as client:

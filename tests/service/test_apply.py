@@ -76,8 +76,7 @@ async def test_a_restore_goes_back_to_before_the_last_apply_once(cache: str) -> 
     async with browsing(vehicle, cache=cache) as browser:
         problem(await browser.post(f"{V}/restore", json={}), 404, "not-in-cache")
         await browser.post(f"{V}/apply", json={"values": {"PARAM_04": 44}})
-        done = (await browser.post(f"{V}/restore", json={})).json()
-        assert done["complete"]
+        assert (await browser.post(f"{V}/restore", json={})).json()["complete"]
         assert vehicle.param("PARAM_04").value == 4
         again = problem(await browser.post(f"{V}/restore", json={}), 409, "already-restored")
         body = {"at": again["before_restore"]}

@@ -254,8 +254,7 @@ async def test_rule_2_extended_parameters() -> None:
         await station.ask(new, new, seconds=3.0)
         [acknowledged] = station.of(messages.ParamExtAck)
         assert acknowledged == messages.ParamExtAck("CAM_NAME", new.raw, ParamType.CUSTOM, 0)
-        wrong = messages.ParamExtSet(1, 100, "CAM_NAME", bytes(128), ParamType.UINT8)
-        await station.ask(wrong)
+        await station.ask(messages.ParamExtSet(1, 100, "CAM_NAME", bytes(128), ParamType.UINT8))
         assert [each.param_result for each in station.of(messages.ParamExtAck)] == [1]
 
 
@@ -395,8 +394,7 @@ async def test_rule_2_a_station_does_not_close_the_session_of_the_fetch(opcode: 
 
 async def test_rule_3_a_list_that_is_asked_during_the_fetch_streams_it() -> None:
     """All who ask share one fetch; the first value comes within 2 s."""
-    air = Air.symmetric([PX4Vehicle()], loss=0.2, delay=0.05, seed=1)
-    vehicle = Tap(air)
+    vehicle = Tap(Air.symmetric([PX4Vehicle()], loss=0.2, delay=0.05, seed=1))
     async with gateway_over(vehicle) as served:
         await served.clients[0].component()
         stations = [served.partner(system=number) for number in range(250, 254)]
@@ -617,8 +615,7 @@ async def test_rule_4_a_set_is_a_verified_write_of_its_station() -> None:
     async with in_sync(small_px4()) as (served, vehicle, station):
         other = served.partner(system=9)
         other.send(GCS)
-        component = await served.clients[0].component()
-        changes = component.changes()
+        changes = (await served.clients[0].component()).changes()
         vehicle.received.clear()
         for _ in range(3):
             station.send(set_to("PARAM_01", 33))
@@ -779,8 +776,7 @@ async def test_rule_6_telemetry_holds_no_list_up() -> None:
 
 @pytest.mark.parametrize("loss", [0.0, 0.2])
 async def test_rule_7_no_losses_but_those_of_the_radio(loss: float) -> None:
-    air = Air.symmetric([PX4Vehicle()], loss=loss, seed=3)
-    async with gateway_over(air) as served:
+    async with gateway_over(Air.symmetric([PX4Vehicle()], loss=loss, seed=3)) as served:
         station = served.partner()
         station.send(GCS)
         await served.synced()
@@ -937,8 +933,7 @@ async def test_rule_11_a_loop_ends() -> None:
     """The endpoint leads to the vehicle link itself."""
     vehicle = Tap(small_px4())
     loop = Puppet(lambda message: (), heartbeat=None)
-    link = PeersLink({"vehicle": vehicle, "loop": loop})
-    async with gateway_over(link) as served:
+    async with gateway_over(PeersLink({"vehicle": vehicle, "loop": loop})) as served:
         station = served.partner()
         station.send(GCS)
         await served.synced()
