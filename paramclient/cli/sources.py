@@ -123,7 +123,7 @@ def check_link(text: str) -> None:
 
 def not_a_file(text: str) -> str:
     """Return why a text names no file, as the beginning of a sentence."""
-    return f"{text} is a folder" if os.path.isdir(text) else f"no such file: {text}"  # noqa: PTH112 - any text
+    return f"{text} is a folder, not a file" if os.path.isdir(text) else f"no such file: {text}"  # noqa: PTH112 - any text
 
 
 def part_of(params: ParamSet, names: Container[str]) -> ParamSet:
@@ -185,8 +185,7 @@ async def save(
     for each in sets:
         kept, left_out = writable(each, written)
         if left_out:
-            what = f"left out, as {written} cannot hold them: {listed(left_out)}; json holds most"
-            report(f"{address(each)}: {what}")
+            report(f"{address(each)}: left out, as {written} cannot hold them: {listed(left_out)}; json can")
         if each.lacks:
             report(f"{address(each)} is incomplete: {each.lacks}")
         files.setdefault(filled(str(file), each, address(each)), []).append(kept)

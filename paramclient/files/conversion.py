@@ -54,7 +54,7 @@ def _read_packed(reading: Reading, file_format: FileFormat) -> ParamFile:
         FileError: the file is invalid.
     """
     try:
-        pack = param_pck.decode(reading.data)
+        pack = param_pck.decode(reading.data, checks_names=False)
     except PackError as error:
         raise FileError(f"invalid packed parameter file: {error}", source=reading.source) from error
     if pack.total > len(pack.entries):
@@ -62,7 +62,10 @@ def _read_packed(reading: Reading, file_format: FileFormat) -> ParamFile:
     for name, kind, bits, default in pack.entries:
         known = bits if default is None and pack.with_defaults else default
         value, own = from_bits(bits, kind), None if known is None else from_bits(known, kind)
-        reading.add(WrittenParam(name, value, kind, own), "")
+        try:
+            reading.add(WrittenParam(check_name(name), value, kind, own), "")
+        except UsageError as error:
+            reading.fault(None, str(error), is_row=True)
     return reading.file(file_format)
 
 

@@ -170,6 +170,10 @@ def read_json(reading: Reading, file_format: FileFormat) -> ParamFile:
     content = read_json_text(_remark.sub(read_remark, reading.text), reading.source)
     if not isinstance(content, dict) or _KEY not in content:
         raise FileError("not a parameter file of paramclient (JSON)", source=reading.source)
+    if type(version := content[_KEY]) is int and version > VERSION:
+        raise FileError(
+            f"a newer paramclient wrote it, in version {version} of the format", source=reading.source
+        )
     found = _checked(reading, content, (), _DOCUMENT, {_KEY, "sets"})
     sets = [_set(reading, each, ("sets", place)) for place, each in enumerate(found.get("sets", []))]
     if len({each.is_extended for each in sets}) > 1:
@@ -183,22 +187,16 @@ def _set(reading: Reading, content: object, place: Place) -> ParamSet:
     is_extended = found.get("extended", False)
     params = {}
     for name, each in found.get("params", {}).items():
-        at = (*place, "params", name)
-        try:
-            check_name(name)
-        except UsageError as error:
-            _fault(reading, at, str(error))
-            continue
-        if not is_portable_name(name):
-            at_line = "" if (line := _line_of(reading.text, name)) is None else f"line {line}: "
-            reading.notes.append(f"{at_line}the client ignores a parameter called {name!r} of a vehicle.")
-        before = reading.fault_count
+        at, before = (*place, "params", name), reading.fault_count
         known = _checked(reading, each, at, _PARAM, {"value"})
         if reading.fault_count == before:
             try:
                 params[name] = _param(name, known, is_extended=is_extended)
             except UsageError as error:
                 _fault(reading, at, str(error))
+        if name in params and not is_portable_name(name):
+            at_line = "" if (line := _line_of(reading.text, name)) is None else f"line {line}: "
+            reading.notes.append(f"{at_line}the client ignores a parameter called {name!r} of a vehicle.")
     identity = None
     if "identity" in found:
         known = _checked(reading, found["identity"], (*place, "identity"), _IDENTITY, _IDS)
@@ -211,7 +209,7 @@ def _param(name: str, found: Mapping[str, Any], *, is_extended: bool) -> Written
     """Return the parameter of valid fields.
 
     Raises:
-        UsageError: the fields contradict each other.
+        UsageError: no parameter can have the name, or the fields contradict each other.
     """
     kind, default = found.get("type"), found.get("default")
     value = _custom(found["value"]) if kind is _CUSTOM else _number(found["value"])
@@ -226,7 +224,7 @@ def _param(name: str, found: Mapping[str, Any], *, is_extended: bool) -> Written
     if "bits" in found:
         value = _with_bits(value, kind, found["bits"])
         is_raw = isinstance(value, bytes)
-    return WrittenParam(name, value, kind, default, found.get("comment", ""), is_raw=is_raw)
+    return WrittenParam(check_name(name), value, kind, default, found.get("comment", ""), is_raw=is_raw)
 
 
 def _whole(low: int, high: float, words: str) -> Callable[[Any], Any]:

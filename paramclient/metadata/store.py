@@ -50,6 +50,8 @@ ARDUPILOT: Final[dict[VehicleKind, tuple[str, tuple[int, ...]]]] = {
 MAV_TYPE of the heartbeat."""
 OLD_NAMES: Final = {"APMrover2": "Rover", "ArduRover": "Rover"}
 """Names of earlier versions of these firmwares."""
+_has_encoding: Final = re.compile(rb"""\s*<\?xml[^>]*encoding=["'](?!utf-8)""", re.IGNORECASE).match
+"""Whether an XML declaration names another encoding than UTF-8."""
 _version: Final = re.compile(r"[0-9]{1,3}(\.[0-9]{1,3}){0,2}").fullmatch
 _kinds: Final[dict[str, VehicleKind]] = {kind: kind for kind in get_args(VehicleKind)}
 _name: Final = re.compile(rf"({'|'.join(_kinds)})(?:-([0-9.]+))?\.added").fullmatch
@@ -105,12 +107,16 @@ def json_of(content: bytes) -> dict[str, object]:
     from pydantic_core import from_json  # imported here: loads pydantic
 
     try:
-        document = from_json(decoded(content.decode("utf-8", "surrogateescape")))
+        document = from_json(_text_of(content))
     except ValueError as error:
         raise UsageError(f"not JSON: {error}") from None
     if not isinstance(document, dict):
         raise UsageError("is JSON, but not an object")
     return document
+
+
+def _text_of(content: bytes) -> str:
+    return decoded(content.decode("utf-8", "surrogateescape"))
 
 
 def unpacked(content: bytes) -> bytes:
@@ -144,7 +150,7 @@ def _read_unpacked(content: bytes) -> Metadata:
     from paramclient.metadata import schemas  # imported here: loads pydantic
 
     if start == b"<":
-        return schemas.read_xml(content)
+        return schemas.read_xml(content if _has_encoding(content) else _text_of(content).encode())
     document = json_of(content)
     if "parameters" in document:
         return schemas.read_parameters(document)
@@ -178,9 +184,6 @@ class MetadataStore:
     def beside(cls, cache: str | os.PathLike[str]) -> MetadataStore:
         """Return the store of a cache: the folder with the cache's name and the suffix `.metadata`."""
         return cls(Path(cache).with_suffix(".metadata"))
-
-    def __repr__(self) -> str:
-        return f"<MetadataStore {self.folder}>"
 
     @property
     def has_notes(self) -> bool:

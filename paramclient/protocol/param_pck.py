@@ -71,21 +71,23 @@ class Pack(NamedTuple):
     with_defaults: bool
 
 
-def decode(data: bytes) -> Pack:
+def decode(data: bytes, *, checks_names: bool = True) -> Pack:
     """Decode a file from a vehicle.
+
+    Without `checks_names`, a name may have characters that no param_id has; bytes are read as Latin-1.
 
     Raises:
         PackError: the file is invalid: magic, type, flag or name, a name that occurs twice, a truncated file,
             another number of entries than in the header, or more bytes than possible.
     """
-    pack, number = decode_prefix(data)
+    pack, number = decode_prefix(data, checks_names=checks_names)
     if len(pack.entries) < number:
         what = f"the file is cut off: {len(pack.entries)} of {number} entries"
         raise PackError(what, offset=len(data))
     return pack
 
 
-def decode_prefix(data: bytes) -> tuple[Pack, int]:
+def decode_prefix(data: bytes, *, checks_names: bool = True) -> tuple[Pack, int]:
     """Decode the complete entries at the beginning of a file from a vehicle.
 
     No entry depends on later ones, so each of these is valid, whatever is missing. Also returns the number of
@@ -104,7 +106,7 @@ def decode_prefix(data: bytes) -> tuple[Pack, int]:
     if total < number:
         raise PackError(f"{number} entries of a table of {total}", offset=2)
     with_defaults = magic == _MAGIC_WITH_DEFAULTS
-    return Pack(_entries(data, number, with_defaults), total, with_defaults), number
+    return Pack(_entries(data, number, with_defaults, checks_names), total, with_defaults), number
 
 
 def encode(
@@ -144,7 +146,7 @@ def header(number: int, total: int, *, with_defaults: bool = False) -> bytes:
     return _HEADER.pack(_MAGIC_WITH_DEFAULTS if with_defaults else _MAGIC, number, total)
 
 
-def _entries(data: bytes, number: int, with_defaults: bool) -> tuple[PackedParam, ...]:
+def _entries(data: bytes, number: int, with_defaults: bool, checks_names: bool) -> tuple[PackedParam, ...]:
     """Decode the entries behind the header: that many, or the complete ones of a truncated file."""
     found: dict[str, PackedParam] = {}
     name = b""
@@ -167,7 +169,7 @@ def _entries(data: bytes, number: int, with_defaults: bool) -> tuple[PackedParam
             raise PackError(f"entry {place} shares {shared} characters with {name!r}", offset=at)
         name = name[:shared] + data[at + 2 : value_at]
         text = name.decode("latin-1")
-        if len(name) > NAME_LENGTH or not (text.isascii() and text.isprintable()):
+        if len(name) > NAME_LENGTH or (checks_names and not (text.isascii() and text.isprintable())):
             raise PackError(f"entry {place} has the name {text!r}", offset=at)
         if text in found:
             raise PackError(f"{text} occurs twice", offset=at)

@@ -240,6 +240,9 @@ def test_an_incomplete_packed_file_has_a_note() -> None:
     assert file.notes == ("The file has 1 of the vehicle's 3 parameters.",)
     assert "contains no parameters" in str(failed(param_pck.encode([])))
     assert "invalid packed parameter file: the file is cut off" in str(failed(param_pck.encode([entry])[:-1]))
+    odd = param_pck.encode([entry, entry._replace(name="B")]).replace(b"A", b"\xc4")
+    assert "only printable ASCII" in str(failed(odd))
+    assert [*loads(odd, partial=True).choose()] == ["B"]
 
 
 # Lines that resemble a parameter
@@ -570,7 +573,11 @@ def test_an_invalid_field_is_rejected(fields: str, problem: str) -> None:
     [
         ("{", "expected JSON"),
         ("{}", "not a parameter file of paramclient (JSON)"),
-        ('{"paramclient": 2, "sets": []}', "paramclient"),
+        (
+            '{"paramclient": 2, "units": []}',
+            "a newer paramclient wrote it, in version 2 of",
+        ),
+        ('{"paramclient": 0, "sets": []}', "it should be 1, the version of the format, found 0"),
         ('{"paramclient": 1, "sets": []}', "contains no parameters"),
         ('{"paramclient": 1, "sets": [{"at": "2026-01-31T12:00:00", "params": {}}]}', "needs its zone"),
         ('{"paramclient": 1, "sets": [{"at": "2026-02-31T12:00:00Z", "params": {}}]}', "found '2026-02-31"),

@@ -276,6 +276,9 @@ def test_a_document_type_is_rejected(text: str, encoding: str) -> None:
 def test_a_description_in_another_encoding_is_read() -> None:
     content = px4({"name": "A", "shortDesc": "H?he"}).replace(b"?", b"\xf6")
     assert read_content(content, source="the file")["A"].short_description == "Höhe"
+    for head in ("", '<?xml version="1.0" encoding="utf-8"?>', "<?xml version='1.0' encoding='latin1'?>"):
+        content = f'{head}<paramfile><param name="A" humanName="Höhe"/></paramfile>'.encode("cp1252")
+        assert read_content(content, source="the file")["A"].short_description == "Höhe"
 
 
 def test_empty_ranges_and_invalid_values_are_left_out() -> None:
