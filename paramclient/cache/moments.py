@@ -34,8 +34,7 @@ _MOMENT: Final = re.compile(
 
 def parse_moment(text: str, now: float) -> float | int:
     """Return the time in a text as `parse_time`, or the number of a snapshot, as `state_at` takes them."""
-    is_number = text.isdecimal() and len(text) <= SNAPSHOT_DIGITS_MAX
-    return int(text) if is_number else parse_time(text, now)
+    return int(text) if text.isdecimal() and len(text) <= SNAPSHOT_DIGITS_MAX else parse_time(text, now)
 
 
 def parse_time(text: str, now: float, zone: tzinfo | None = None) -> float:

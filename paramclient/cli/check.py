@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Hashable, Sequence
 from contextlib import suppress
 from statistics import median
 from typing import Final, TypeVar
@@ -16,6 +16,7 @@ from paramclient.cli.output import ExitCode, Status, milliseconds, print_json, p
 from paramclient.cli.session import ChosenVehicle, Deadline, open_client, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.component import Component
+from paramclient.client.taps import FrameCutter, SeenFrame, Tap
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.model.notation import hash_text
 from paramclient.protocol.commands import request_message
@@ -24,7 +25,7 @@ from paramclient.protocol.list_download import download_list
 from paramclient.protocol.param_pck import PARAM_FILE, Pack, decode
 from paramclient.protocol.selection import node_in_words
 from paramclient.version import __version__
-from paramclient.wire.messages import HASH_CHECK, AutopilotVersion
+from paramclient.wire import messages
 
 CHECK_TIMEOUT: Final = 60.0
 """Seconds for the whole measurement without --timeout: a list at 57600 baud takes 35."""
@@ -45,21 +46,20 @@ ROUND_TRIP_LONG: Final = 0.5
 LIST_RATE_SLOW: Final = 200.0
 """Values per second below which a list is reported as slow. ArduPilot sends 1,680 and PX4 1,000 over UDP or
 USB (measured); a 57600 baud radio carries 40."""
-SLOW_LIST: Final = (
-    ": a slow port, a radio, or a low-bandwidth mode. Raise the port's baud rate or data rate "
-    "(PX4: MAV_n_RATE, ArduPilot: SERIALn_BAUD)."
-)
+SLOW_LIST: Final = ": a slow port or radio. Raise its rate (PX4: MAV_n_RATE, ArduPilot: SERIALn_BAUD)."
 """Causes of a slow list, and what to do."""
 ENABLE_FTP: Final = "Check that BRD_OPTIONS leaves MAVFTP on (bit 1), and that the firmware is 4.1 or newer."
 """What to do about an ArduPilot that serves no parameter file."""
 LESS_LOSS: Final = "Check antenna, distance and baud rate, or send less telemetry on this link."
 """What to do about lost frames."""
 NO_ACKNOWLEDGEMENT: Final = (
-    "No command was acknowledged: frames to the vehicle are lost, another station was first on a port that "
-    "answers only one (PX4 over UDP), or the vehicle expects signed frames. Close other ground stations and "
-    "restart the vehicle's link; with signing, give --signing-key."
+    "No command was acknowledged: frames to the vehicle are lost, or another station was first (PX4 over UDP "
+    "answers only one): close it, and restart the link. A vehicle that signs needs --signing-key."
 )
 """The finding about a vehicle that acknowledges no command, and what to do about it."""
+
+PROOF: Final = (messages.ParamRequestRead, messages.ParamValue, messages.FileTransfer)
+"""Messages with which a cached table is proven."""
 
 Result = TypeVar("Result")
 
@@ -99,6 +99,18 @@ async def check(
     print_line("" if found.findings else "\nNothing slow or unusual.")
     print_table(("severity", "slow or unusual"), found.findings)
     return found.code
+
+
+class _Proof(Tap):
+    """Counts the bytes of the frames that prove a table, in both directions."""
+
+    size = 0
+
+    def received(self, frames: Sequence[SeenFrame], size: int, peer: Hashable) -> None:
+        self.size += sum(each.size for each in frames if isinstance(messages.decode(each.frame), PROOF))
+
+    def sent(self, frame: bytes) -> None:
+        self.received(FrameCutter(stream=False).cut(frame, None), len(frame), None)
 
 
 class _Check:
@@ -148,7 +160,7 @@ class _Check:
             for _ in range(ROUND_TRIP_COUNT):
                 began = anyio.current_time()
                 with anyio.fail_after(self._deadline.left(MEASURE_TIMEOUT)):
-                    await request_message(self._component.node.channel, AutopilotVersion)
+                    await request_message(self._component.node.channel, messages.AutopilotVersion)
                 trips.append(round(anyio.current_time() - began, 4))
         self.json["link"] = {"name": self._client.link.name, "round_trip": None}
         if not trips:
@@ -160,27 +172,25 @@ class _Check:
         words = f"{milliseconds(middle)} (at most {milliseconds(most)}, {len(trips)} commands)"
         self.rows.append(("round trip", words))
         if middle >= ROUND_TRIP_LONG:
-            text = f"The round trip is {middle:.2f} s. Each repeat of a lost request takes at least as long."
-            self.findings.append(("slow", text))
+            self.findings.append(("slow", f"The round trip is {middle:.2f} s: each repeat takes as long."))
 
     async def _hash(self) -> None:
         """Read PX4's hash or ArduPilot's checksum, with its time and its bytes of both directions."""
-        client, component, timeout = self._client, self._component, self._deadline.left(MEASURE_TIMEOUT)
-        before = client.bytes_sent + client.bytes_received
+        component, timeout = self._component, self._deadline.left(MEASURE_TIMEOUT)
+        taps, proof = self._client.core.link_task.taps, _Proof()
+        taps.append(proof)
         if is_ardupilot := component.autopilot == "ardupilot":
             crc, found = await _measured(component.file_checksum(PARAM_FILE, timeout=timeout))
         else:
-            param, found = await _measured(component.get(HASH_CHECK, timeout=timeout))
+            param, found = await _measured(component.get(messages.HASH_CHECK, timeout=timeout))
             crc = None if param is None else param.bits
-        found |= {"before": hash_text(crc), "bytes": client.bytes_sent + client.bytes_received - before}
+        taps.remove(proof)
+        found |= {"before": hash_text(crc), "bytes": proof.size}
         self.json["hash"], problem = found, found["error"]
-        words = f"none: {problem}"
-        if not problem:
-            words = f"{found['before']}, {found['bytes']} bytes in {milliseconds(found['elapsed_s'])}"
-        self.rows.append(("checksum" if is_ardupilot else "hash", words))
+        words = f"{found['before']}, {proof.size} bytes in {milliseconds(found['elapsed_s'] or 0.0)}"
+        self.rows.append(("checksum" if is_ardupilot else "hash", f"none: {problem}" if problem else words))
         if problem and component.autopilot == "px4":
-            text = f"{problem}: each session downloads the table anew. Set MAV_HASH_CHK_EN to 1."
-            self.findings.append(("slow", text))
+            self.findings.append(("slow", f"{problem}: each session downloads. Set MAV_HASH_CHK_EN to 1."))
 
     async def _list(self) -> None:
         """Measure one list download, also if a file download would be faster."""
@@ -201,8 +211,7 @@ class _Check:
         first = min(at.values(), default=0.0)
         steady = [each for each in at if each >= STEADY_SHARE * received and at[each] > first]
         rate = round(steady[0] / (at[steady[0]] - first), 4) if steady else None
-        lost = result.lost if result else 0
-        missing = len(result.missing) if result else (count or 0) - received
+        lost, missing = (result.lost, len(result.missing)) if result else (0, (count or 0) - received)
         found |= {"count": count, "received": received, "elapsed_s": round(elapsed, 4), "per_s": rate}
         self.json["list"] = found | {"lost": lost, "missing": missing}
         words = f"{received} of {count or '?'} in {elapsed:.2f} s"

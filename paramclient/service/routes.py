@@ -354,8 +354,7 @@ async def fetch(target: TargetArgument, body: FetchRequest) -> JsonObject:
     result = await target.fetch(refresh=body.refresh, timeout=body.timeout_s)
     if body.metadata:
         await target.load_metadata(timeout=body.timeout_s)
-    known = dict(component.params)
-    return json_output.fetch_json(component, result, known.values(), target.metadata)
+    return json_output.fetch_json(component, result, component.params.values(), target.metadata)
 
 
 # files
@@ -427,8 +426,7 @@ async def apply_(author: Author, target: TargetArgument, body: ApplyRequest) -> 
     """
     wanted = await _wanted(target, body)
     options = body.model_dump(exclude={"values", "file", "at", "only"}) | _context(author, target)
-    result = await apply(target.component, wanted, **options)
-    return apply_json(result, target.component)
+    return apply_json(await apply(target.component, wanted, **options), target.component)
 
 
 @writing.post(f"{VEHICLE}/restore", dependencies=[Depends(_only_apply)])
@@ -439,8 +437,7 @@ async def restore_(author: Author, target: TargetArgument, body: RestoreRequest)
     else:
         state = await target.state_at(body.at)
     options = body.model_dump(exclude={"at"}) | _context(author, target)
-    result = await restore(target.component, state, **options)
-    return apply_json(result, target.component)
+    return apply_json(await restore(target.component, state, **options), target.component)
 
 
 async def _wanted(target: Target, body: PlanRequest) -> ParamSet:
