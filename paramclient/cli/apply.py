@@ -213,8 +213,7 @@ async def _earlier_state(moment: float | int | None, session: CommandSession) ->
         find = bind(apply_restore.load_restore_point, cache, *place, extended=extended)
         point = await anyio.to_thread.run_sync(find)
     except (errors.CacheError, errors.UnknownVehicle) as error:  # the user named no vehicle of the cache
-        end = "; a backup file can be restored without the cache (--no-cache)"
-        raise errors.CacheError(f"nothing was sent, as no earlier state can be read: {error}{end}") from error
+        raise errors.CacheError(f"nothing was sent, as no earlier state can be read: {error}") from error
     when = f"{age_in_words(time.time() - point.at)} ago (snapshot {point.snapshot})"
     changed = listed([*point.changes]) or "nothing, as far as is known"
     say(f"{session.prefix}the state is that before the last apply, {when}; changed since then: {changed}")
@@ -275,7 +274,8 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
             with ParamCache(flags.cache) as cache:
                 await anyio.to_thread.run_sync(bind(cache.save, (), durable=True))
         except errors.CacheError as failure:
-            raise errors.CacheError(f"nothing was sent: {failure}; --no-cache does without") from failure
+            hint = "--no-cache does without, and restore then needs a backup file"
+            raise errors.CacheError(f"nothing was sent: {failure}; {hint}") from failure
     async with sessions(url, flags, writes=True) as found:
         jobs, backups = dict[CommandSession, _Job](), set[str]()
 
@@ -372,9 +372,13 @@ class _Job:
         options = self.options | {"timeout": session.deadline.left(), "progress": update}
         options["before_writing"] = session.check_only
         with Status(f"{title}: waiting for the first response", title) as status:
-            self.found = await run_apply(
-                session.component, state.params, options, is_restore=state.is_restore
-            )
+            run = run_apply(session.component, state.params, options, is_restore=state.is_restore)
+            try:
+                self.found = await run
+            except errors.InvalidParameters:
+                if not session.options.json:
+                    raise
+                return await self.make_plan()  # which has them
         return self
 
     def as_json(self) -> JsonObject:

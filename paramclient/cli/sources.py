@@ -18,7 +18,7 @@ from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import ExitCode, listed, local_time, print_json, print_table, report, say
 from paramclient.cli.session import ChosenVehicle, CommandSession, noun_of, sessions
 from paramclient.client.component import Component
-from paramclient.errors import UsageError, VehicleError
+from paramclient.errors import UsageError
 from paramclient.files import FileFormat, writable, write_file
 from paramclient.files.disk import check_folder
 from paramclient.files.formats import address, format_of_name
@@ -39,7 +39,7 @@ row would make the table wider than every screen."""
 # Sources
 
 
-async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: bool = False) -> list[ParamSet]:
+async def resolve_all(texts: Sequence[str], options: LinkOptions, **more: bool) -> list[ParamSet]:
     """Return the parameters of each source: files first, then cached vehicles, then links.
 
     A text that is given twice is resolved once. If one of the files has extended parameters, those of the
@@ -48,7 +48,7 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: boo
     Args:
         texts: the arguments.
         options: --vehicle selects the vehicle of a link, and the component of a file or of the cache.
-        writes: whether the values will be written; see `sessions`.
+        more: `writes` and `incomplete`, as in `sets_of`.
 
     Raises:
         ParamClientError: as from `sets_of`.
@@ -60,7 +60,7 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, writes: boo
     found: dict[str, ParamSet] = {}
     each = sorted({*texts}, key=lambda text: (not sources.is_file(text), not sources.is_offline(text), text))
     for text in each:
-        (found[text],), _ = await sets_of(text, options, writes=writes)
+        (found[text],), _ = await sets_of(text, options, **more)
         options = replace(options, extended=options.extended or found[text].is_extended)
     return [found[text] for text in texts]
 
@@ -73,8 +73,8 @@ async def sets_of(
     Args:
         text: a file, a vehicle in the cache, or a link.
         options: --vehicle selects the vehicle of a link, the component of a file or of the cache, or all.
-        writes: as in `resolve_all`.
-        incomplete: whether some parameters of a table may be missing; the source of the set names them.
+        writes: whether the values will be written; see `sessions`.
+        incomplete: whether some parameters of a table may be missing.
 
     Raises:
         UsageError: the text names none of them, or has no parameters for --vehicle.
@@ -169,11 +169,7 @@ async def save(
     written = file_format or format_of_name(str(file))
     if not is_pattern_name(str(file.parent)):
         check_folder(str(file))
-    try:
-        sets, is_part = await sets_of(where, options, incomplete=incomplete)
-    except VehicleError as error:  # the table is incomplete
-        hint = f"{error}; --incomplete writes what was received"
-        raise VehicleError(hint, error.system, error.component) from None
+    sets, is_part = await sets_of(where, options, incomplete=incomplete)
     if changed:
         known = known_of_sets(sets, options, metadata)
         differing = [_differing(*each) for each in zip(sets, known, strict=True)]
@@ -225,6 +221,7 @@ async def diff(
     base: str | None = None,
     only: tuple[str, ...] = (),
     partial: bool = False,
+    incomplete: bool = False,
     metadata: MetadataFile = None,
     options: LinkOptions = LinkOptions(),
 ) -> ExitCode:
@@ -240,10 +237,11 @@ async def diff(
         only: Compare only this name or pattern, such as "MC_*". May be given several times.
         partial: Leave out parameters that only the right side has; if the right side is a file and the left
             one is not, those that only the left side has.
+        incomplete: Take tables of which parameters are missing.
         metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
     """
     given = [left, right, *([] if base in (None, DEFAULTS) else [base or ""])]
-    first, second, *third = await resolve_all(given, options)
+    first, second, *third = await resolve_all(given, options, incomplete=incomplete)
     if partial and sources.is_file(right) and not sources.is_file(left):
         first = part_of(first, second)
     elif partial:

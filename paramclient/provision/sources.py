@@ -235,16 +235,9 @@ def component_set(component: Component, params: Iterable[Param], source: str, la
     `source` and `lacks` are as in `ParamSet`.
     """
     link = component.core.link
-    return ParamSet(
-        {param.name: param for param in params},
-        component=component.component,
-        system=component.system,
-        identity=component.identity,
-        at=link.at if isinstance(link, ReplayLink) else time.time(),
-        source=source,
-        is_extended=component.is_extended,
-        lacks=lacks,
-    )
+    named, ids = {param.name: param for param in params}, (component.component, component.system)
+    at = link.at if isinstance(link, ReplayLink) else time.time()
+    return ParamSet(named, *ids, component.identity, at, source, component.is_extended, lacks)
 
 
 def fetched_set(component: Component, result: FetchResult, *, source: str, partial: bool = False) -> ParamSet:
@@ -269,7 +262,7 @@ def fetched_set(component: Component, result: FetchResult, *, source: str, parti
             f"{component.system}/{component.component} {component.autopilot} on {component.identity.link}"
         )
         was = f"{first_of(missing, NAMES_SHOWN_MAX)} {'was' if len(missing) == 1 else 'were'} not received"
-        raise VehicleError(f"{vehicle} is incomplete: {was}", component.system, component.component)
+        raise _incomplete(f"{vehicle} is incomplete: {was}", component.system, component.component)
     known = [name for name in result.params if name not in result.cached]
     return part_set(component, [result.params[name] for name in known], source, missing)
 
@@ -281,6 +274,10 @@ def part_set(component: Component, params: Collection[Param], source: str, lacks
         kept = sum(param.index is not None for param in params)
         words = f"{kept} of {component.count} parameters, without {first_of(names, NAMES_SHOWN_MAX)}"
     return component_set(component, params, source, words)
+
+
+def _incomplete(what: str, system: int, component: int) -> VehicleError:
+    return VehicleError(f"{what}; save and diff take it with --incomplete", system, component)
 
 
 def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> ParamSet:
@@ -297,7 +294,7 @@ def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> Par
         lacks += f", and {others} read by name" if others else ""
         if not partial:
             message = f"{table.system}/{table.component} is incomplete: {lacks}"
-            raise VehicleError(message, system=table.system, component=table.component)
+            raise _incomplete(message, table.system, table.component)
     at, source = table.updated_at if table.synced_at is None else table.synced_at, f"cache {table.key}"
     return ParamSet(table.params, table.component, table.system, table.identity, at, source, extended, lacks)
 

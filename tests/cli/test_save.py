@@ -67,12 +67,15 @@ def test_what_was_received_is_written_with_incomplete_and_the_file_names_the_oth
     table = {**TABLE, "RC MAP": (1.0, ParamType.REAL32)}
     vehicle, path = Partial(table, count=lambda index: len(table) + 1), tmp_path / f"quad.{ending}"
     for where, why in (
-        (put(vehicle), "index 9 was not received; --incomplete writes what was received"),
+        (put(vehicle), "index 9 was not received; save and diff take it with --incomplete"),
         ("1", "1/1 is incomplete: 8 of 10 parameters are in the cache"),
     ):
         refused = command("save", where, path)
         assert (refused.code, refused.out, why in refused.err) == (1, "", True), refused.err
         assert not path.exists()
+        assert (
+            command("diff", where, where).code == command("diff", where, where, "--incomplete").code + 1 == 1
+        )
         saved = command("save", where, path, "--incomplete")
         assert (saved.code, saved.out) == (0, "")
         assert set(read_file(path).choose()) == set(TABLE) - ({"NODE_ID"} if ending == "pck" else set())
