@@ -264,8 +264,8 @@ class VehicleLink(Tap):
                     self.signing.add(source)
                 node = self._station.nodes.get(source)
                 if seen.frame.message_id == HEARTBEAT and node is not None:
-                    table = self._table(node, extended=False)
-                    table.heartbeat, table.beats = decode(seen.frame), table.beats + 1
+                    for table in (self._table(node, extended=each) for each in (False, True)):
+                        table.heartbeat, table.beats = decode(seen.frame), table.beats + 1
                     for name in node.plain.table.params.keys() & GROUND_STATION_PARAMS:
                         self.avoid(node.plain.table.params[name].value)
                 self._gateway.pass_on(self, seen, peer)

@@ -178,7 +178,7 @@ class KeptTable(Stream[Change]):
     Attributes:
         component, session, source: of the component.
         changes: the number of changes so far.
-        heartbeat, beats: the last one with plain parameters, and how many there were.
+        heartbeat, beats: the component's last heartbeat, and how many there were.
     """
 
     most = 0  # changes are taken at once, and none is queued

@@ -64,8 +64,7 @@ async def test_without_a_token_only_the_page_and_health_are_served(tokens: Any) 
             if "security" not in paths[path][method.lower()]:
                 assert address == "/health"
                 continue
-            answer = await browser.request(method, address, json=body_for(address))
-            problem(answer, 401, "unauthorized")
+            problem(await browser.request(method, address, json=body_for(address)), 401, "unauthorized")
         assert (await browser.get("/")).status_code == 200
         health = (await browser.get("/health")).json()
         assert (health["role"], "links" in health) == (None, False)

@@ -79,8 +79,7 @@ async def test_a_restore_goes_back_to_before_the_last_apply_once(cache: str) -> 
         assert (await browser.post(f"{V}/restore", json={})).json()["complete"]
         assert vehicle.param("PARAM_04").value == 4
         again = problem(await browser.post(f"{V}/restore", json={}), 409, "already-restored")
-        body = {"at": again["before_restore"]}
-        assert (await browser.post(f"{V}/restore", json=body)).json()["complete"]
+        assert (await browser.post(f"{V}/restore", json={"at": again["before_restore"]})).json()["complete"]
         assert vehicle.param("PARAM_04").value == 44
 
 

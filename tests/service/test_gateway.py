@@ -629,8 +629,7 @@ async def test_rule_4_a_set_is_a_verified_write_of_its_station() -> None:
 
 
 async def test_rule_4_different_sets_queue() -> None:
-    air = Air.symmetric([small_px4()], loss=0.3, delay=0.05, seed=4)
-    async with in_sync(air) as (served, _, first):
+    async with in_sync(Air.symmetric([small_px4()], loss=0.3, delay=0.05, seed=4)) as (served, _, first):
         second = served.partner(system=9)
         await second.ask(set_to("PARAM_01", 9), seconds=0.01)
         await first.ask(set_to("PARAM_01", 33), seconds=5.0)
@@ -694,6 +693,17 @@ async def test_rule_4_an_error_within_3_seconds_during_the_fetch_by_a_vehicle_th
         vehicle.is_deaf = True
         await station.ask(set_to("ATC_ANG_RLL_P", 3, ParamType.REAL32), seconds=3.0)
         assert station.of(messages.ParamError) == [messages.ParamError(255, 190, "ATC_ANG_RLL_P", -1, 4)]
+
+
+async def test_rule_4_an_error_within_3_seconds_during_the_fetch_by_a_camera_too() -> None:
+    vehicle = Tap(Camera(burst=1, period=1.0))
+    async with gateway_over(vehicle) as served:
+        await served.clients[0].component(1, 100)
+        station = served.partner()
+        await station.ask(messages.ParamExtRequestList(1, 100), seconds=2.0)
+        vehicle.is_deaf = True
+        await station.ask(messages.ParamExtSet(1, 100, "CAM_NAME", bytes(128), ParamType.CUSTOM), seconds=3.0)
+        assert [each.param_result for each in station.of(messages.ParamExtAck)] == [2]
 
 
 # 5: changes
@@ -858,8 +868,7 @@ async def test_rule_8_no_set_is_signed_for_an_unsigned_station_where_the_vehicle
 
 
 async def test_rule_9_the_gateway_is_no_ground_station() -> None:
-    model = ArduPilotVehicle(table={"SYSID_MYGCS": 254.0, "A": 1.0})
-    async with in_sync(model) as (_, vehicle, _):
+    async with in_sync(ArduPilotVehicle(table={"SYSID_MYGCS": 254.0, "A": 1.0})) as (_, vehicle, _):
         await anyio.sleep(3.0)
         vehicle.received.clear()
         await anyio.sleep(3.0)
@@ -883,8 +892,7 @@ async def test_rule_9_the_gateway_has_the_id_of_no_station() -> None:
 
 
 async def test_rule_10_a_list_of_all_components() -> None:
-    silent = Puppet(lambda message: (), component=5)
-    async with in_sync(Air([small_px4(), silent])) as (_, vehicle, station):
+    async with in_sync(Air([small_px4(), Puppet(lambda message: (), component=5)])) as (_, vehicle, station):
         station.send(ParamRequestList(1, 5))
         await anyio.sleep(30.0)
         vehicle.received.clear()
