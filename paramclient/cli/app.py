@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Final
 
 import anyio
-from cyclopts import App, CycloptsError, MissingArgumentError, Parameter
+from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, UnusedCliTokensError
 
 from paramclient.cli.output import STDIN, ExitCode, code_of, report, say, text_of
 from paramclient.errors import ParamClientError
@@ -46,10 +46,12 @@ def run(arguments: Sequence[str]) -> int:
             call = partial(command, *words, **named)
             code = anyio.run(_until_signal, call) if inspect.iscoroutinefunction(command) else call()
         except CycloptsError as error:
-            usage = None
+            text = str(error)
             if isinstance(error, MissingArgumentError):
-                usage = dict(subcommands())[" ".join(error.command_chain or ())].usage
-            report(f"{error} {usage or ''}".rstrip().replace("Unused Tokens", "not expected"))
+                text += f" {dict(subcommands())[' '.join(error.command_chain or ())].usage}"
+            elif isinstance(error, UnusedCliTokensError):
+                text = f"not expected: {' '.join(error.unused_tokens or ())}"
+            report(text)
             return ExitCode.USAGE
         except ParamClientError as error:
             report(text_of(error, takes_all=arguments[0] != "signing"))

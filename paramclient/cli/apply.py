@@ -284,8 +284,7 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
             backup = None
             if flags.backup is not None:
                 backup = filled(flags.backup, session.component, session.label)
-                exists = await anyio.Path(backup).exists()
-                if exists or backup in backups:
+                if await anyio.Path(backup).exists() or backup in backups:
                     problem = "exists already, or is another vehicle's; a name may have {uid} or {system}"
                     raise errors.FileError(problem, source=backup)
                 backups.add(backup)
@@ -405,7 +404,7 @@ class _Job:
         Returns:
             The exit code; of a plan, the one that the command is expected to have.
         """
-        found, session, options = self.found, self.session, self.options
+        found, session, options, params = self.found, self.session, self.options, self.state.params
         words = ", ".join(f"{count} {_WORDS.get(status, status)}" for status, count in found.counts.items())
         remarks = list[str]()
         is_whole = all(row.is_as_wanted for row in found.rows.values() if row.status not in _WORDS)
@@ -435,14 +434,13 @@ class _Job:
                 counts = ", ".join(f"{count} {category}" for category, count in left_out.items())
                 includes = " ".join(f"--include {category}" for category in left_out)
                 own = ", ".join(each for each in left_out if each in apply_restore.OWN_STATE_CATEGORIES)
-                if own and apply_restore.is_own_state(session.component, self.state.params):
+                if own and apply_restore.is_own_state(session.component, params):
                     includes += f"; restore writes this vehicle's own {own} too"
                 remarks.append(f"left out: {counts}; to write them: {includes}")
             if late:
                 remarks.append(f"takes effect after a reboot: {listed(late)}")
             remarks.insert(0, "" if self.state.is_restore else made.unchecked_note)
-        lacks = self.state.params.lacks
-        remarks.append(lacks and f"{self.state.params.source} is incomplete: {lacks}")
+        remarks.append(params.lacks and f"{params.source} is incomplete: {params.lacks}")
         for remark in filter(None, remarks):
             say(f"{session.label}: {remark}")
         return code

@@ -64,8 +64,7 @@ def show_summaries(cache: ParamCache, summaries: Sequence[CachedSummary], *, jso
         members = map(found.get, ("autopilot", "size", "extended", "hash"))
         rows.append([f"{each.system}/{each.component}", *members, synced, each.key])
     columns = ["component", "autopilot", "params", "extended", "hash", "synced", "key"]
-    listed = {"path": cache.place, "components": components}
-    show(listed, columns, rows, json=json, empty="no table is in the cache")
+    show({"path": cache.place, "components": components}, columns, rows, json=json, empty="nothing is cached")
     if not json:
         say(f"the cache is {cache.place}")
 
