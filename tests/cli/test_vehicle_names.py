@@ -93,9 +93,8 @@ def test_an_unknown_or_ambiguous_name_lists_the_vehicles(
 
 
 def test_a_system_id_means_the_vehicle_with_the_autopilot_and_not_its_camera() -> None:
-    camera = CachedVehicle(
-        "uid:ca3e0003", replace(known(3, "ca3e0003").identity, autopilot=8), NOW, NOW, (100,)
-    )
+    identity = replace(known(3, "ca3e0003").identity, autopilot=8)
+    camera = CachedVehicle("uid:ca3e0003", identity, NOW, NOW, (100,))
     kept = [camera, *KEPT]
     assert find_vehicle(kept, "3", place="here") is KEPT[0]
     assert find_vehicle(kept, "3", place="here", component=100) is camera
@@ -141,8 +140,7 @@ COMMANDS = [
 def test_no_subcommand_guesses_a_vehicle(
     command: Command, put: Put, cache: Path, tmp_path: Path, words: list[str], name: str
 ) -> None:
-    vehicle = PX4Vehicle(table={"MC_ROLL_P": 4.0})
-    put(vehicle)
+    put(vehicle := PX4Vehicle(table={"MC_ROLL_P": 4.0}))
     file = tmp_path / "quad.param"
     done = command(*({"NAME": name, "FILE": str(file)}.get(word, word) for word in words))
     assert (done.code, done.out) == (2, "")
@@ -150,8 +148,7 @@ def test_no_subcommand_guesses_a_vehicle(
     wanted = f"vehicle {name.removeprefix('cache:')}"
     assert f"paramclient: {wanted} {'fits 2 vehicles' if several else 'is not'} in the cache" in done.err
     for each in ParamCache(cache).vehicles():
-        is_listed = f"\n  {each}\n" in done.err
-        assert is_listed == (not several or each.identity.system == 9)
+        assert (f"\n  {each}\n" in done.err) == (not several or each.identity.system == 9)
     assert not file.exists()
     assert len(ParamCache(cache).components()) == 3, "nothing is removed"
     assert not vehicle.requests, "nothing is sent"
