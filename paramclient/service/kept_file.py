@@ -179,7 +179,7 @@ class KeptFile:
             return True
         # a vehicle may send a default that is the value, which the table does not keep
         is_here = query is not None and self._is_served and not (is_checksum and query.with_defaults)
-        if is_here and self._table.list_if_current is None:
+        if is_here and not self._table.list_if_current:
             if self._opening.begins((asker, request), asker):
                 self._table.component.core.spawn(self._begin_later, asker, request, key, route)
             return True
@@ -205,7 +205,7 @@ class KeptFile:
                 await self._table.load().wait()
         finally:
             self._opening.end((asker, request))
-        if self._table.list_if_current is not None and self._begin(asker, request, key, route):
+        if self._table.list_if_current and self._begin(asker, request, key, route):
             return
         if self._table.is_loading and request.opcode == Opcode.OPEN_FILE_RO:
             self._say(asker, reply(request, error=FileErrorCode.FILE_NOT_FOUND))

@@ -63,8 +63,7 @@ async def opened(name: str) -> AsyncIterator[Any]:
 @contextmanager
 def udp_socket(to: tuple[str, int] | None = None, *, host: str = "127.0.0.1") -> Iterator[socket.socket]:
     """The remote side on UDP: a blocking socket with its own port, connected if an address is given."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_DGRAM) as sock:
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((host, 0))
         sock.settimeout(TIMEOUT)
         if to is not None:

@@ -84,8 +84,7 @@ async def test_a_restore_goes_back_to_before_the_last_apply_once(cache: str) -> 
 
 
 async def test_snapshots_are_stored_listed_read_and_applied(cache: str) -> None:
-    vehicle = small_px4()
-    async with browsing(vehicle, cache=cache) as browser:
+    async with browsing(small_px4(), cache=cache) as browser:
         made = await browser.post(f"{V}/snapshots", json={"reason": "before the flight"})
         assert made.status_code == 201
         await browser.put(f"{V}/params/PARAM_04", json={"value": 44})

@@ -57,8 +57,7 @@ async def test_a_write_is_an_event_with_its_author_and_both_values_and_an_apply_
         assert stream.last == f"{event['run']}-{event['seq']}"
         applied = await browser.post(f"{V}/apply", json={"values": {"PARAM_04": 8, "PARAM_05": 9}})
         assert applied.json()["complete"]
-        event = await stream.next("apply")
-        assert {"phase", "done", "total", "system", "component"} <= event.keys()
+        assert {"phase", "done", "total", "system", "component"} <= (await stream.next("apply")).keys()
 
 
 async def test_a_vehicle_is_told_when_it_appears_is_fetched_lost_found_and_armed() -> None:
