@@ -19,7 +19,7 @@ from typing import Any
 from paramclient import metadata, provision
 from paramclient.client.blocking import Changes, Component, Events, ParamClient, blocking, call_each
 from paramclient.client.client import Event
-from paramclient.provision.inspection import Wanted
+from paramclient.provision.planning import Wanted
 
 __all__ = [
     "Changes",

@@ -5,11 +5,11 @@ from __future__ import annotations
 import functools
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import PurePath
-from typing import Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from paramclient.errors import FileError, PackError, UsageError
 from paramclient.files import json_format, lists
@@ -20,14 +20,14 @@ from paramclient.model.identity import check_ids, version_text
 from paramclient.model.names import counted, first_of
 from paramclient.model.notation import time_text
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, bits_of, check_name, from_bits, same_bits
+from paramclient.model.values import Param, ParamType, Settable, bits_of, check_name, from_bits, same_bits
 from paramclient.protocol import param_pck
 
 LEFT_OUT_SHOWN_MAX: Final = 20
 """Names that the header of a file shows, of those that are left out."""
 
-Content: TypeAlias = ParamFile | ParamSet | Iterable[ParamSet]
-"""Content to write: a file as read, the parameters of one component, or of several."""
+Content: TypeAlias = ParamFile | ParamSet | Mapping[str, Param | Settable] | Iterable[ParamSet]
+"""Content to write: a file as read, the parameters of one component, also plain values, or of several."""
 
 
 class _Format(NamedTuple):
@@ -262,7 +262,9 @@ def writable(params: ParamSet, file_format: FileFormat) -> tuple[ParamSet, list[
     return replace(params, params=kept, lacks="; ".join(filter(None, (params.lacks, lacks)))), left_out
 
 
-def _as_file(content: ParamSet | Iterable[ParamSet], file_format: FileFormat) -> ParamFile:
+def _as_file(content: Mapping[str, Any] | Iterable[ParamSet], file_format: FileFormat) -> ParamFile:
+    if isinstance(content, Mapping) and not isinstance(content, ParamSet):
+        content = ParamSet(content)
     sets = (content,) if isinstance(content, ParamSet) else tuple(content)
     untold = () if file_format is FileFormat.JSON else sets  # the document has fields for the header's facts
     return ParamFile(sets, file_format, header=tuple(line for each in untold for line in _header_lines(each)))

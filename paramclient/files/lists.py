@@ -190,10 +190,9 @@ def read_qgc(reading: Reading, file_format: FileFormat) -> ParamFile:
         columns = _blanks.split(line.text)
         if len(columns) != 5:  # a name that is empty or has a space
             columns = [each.strip() for each in line.text.split("\t")]
-        if len(columns) != 5:
-            reading.bad_line(line, _QGC_ROW)
-            return
         try:
+            if len(columns) != 5:
+                raise UsageError(_QGC_ROW)
             system, component = _whole(columns[0], 1, 255, _QGC_IDS), _whole(columns[1], 0, 255, _QGC_IDS)
             kind = ParamType(_whole(columns[4], 1, 10, _QGC_TYPE))
             value = _qgc_value(columns[3], kind)

@@ -16,8 +16,8 @@ from paramclient.model.names import age_in_words
 from paramclient.model.paramset import ParamSet, RestorePoint
 from paramclient.provision.apply_rules import OUT_OF_RANGE
 from paramclient.provision.execution import BEFORE_APPLY, BEFORE_RESTORE, ApplyOptions, ApplyResult, run
-from paramclient.provision.inspection import Wanted, wait_for_identity, wanted_set
-from paramclient.provision.planning import Rows
+from paramclient.provision.inspection import wait_for_identity, wanted_set
+from paramclient.provision.planning import Rows, Wanted
 
 Outcome = TypeVar("Outcome", bound=Rows)
 

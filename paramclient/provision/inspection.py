@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Container, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final, TypeAlias, Unpack
+from typing import Final, Unpack
 
 import anyio
 
 from paramclient.client.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param, ParamType, Settable, Trust
-from paramclient.provision.planning import Plan, PlanOptions, plan_from
+from paramclient.model.values import Param, ParamType, Trust
+from paramclient.provision.planning import Plan, PlanOptions, Wanted, plan_from
 from paramclient.provision.sources import component_set, part_set
 
 READS_IN_PROGRESS_MAX: Final = 64
@@ -26,9 +26,6 @@ READ_INTERVAL: Final = 0.025
 """Seconds for one of many reads on a fast link: ArduPilot answers 49 per second (measured)."""
 READ_SIZE_RATIO: Final = 6.0
 """Bytes of a read and its response, 73, over those of one parameter in ArduPilot's file, 13 (measured)."""
-
-Wanted: TypeAlias = ParamSet | Mapping[str, Settable]
-"""The wanted parameters: of a file or a snapshot, or plain values by name."""
 
 
 async def plan(component: Component, wanted: Wanted, **options: Unpack[PlanOptions]) -> Plan:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final, TypedDict, Unpack
+from typing import Final, TypeAlias, TypedDict, Unpack
 
 from paramclient.errors import UsageError
 from paramclient.metadata import ParamInfo
@@ -19,7 +19,7 @@ from paramclient.model.comparison import same_value
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
 from paramclient.model.names import is_group_switch, nearest_names
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import Encoding, Param, ParamType, Value, format_value
+from paramclient.model.values import Encoding, Param, ParamType, Settable, Value, format_value
 from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.provision.apply_rules import ACTION, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
 
@@ -30,6 +30,10 @@ WRONG: Final = "wrong"
 SUGGESTIONS_MAX: Final = 40
 """Missing names up to which similar names are suggested. With more, the file is for another vehicle and has
 no typing errors."""
+
+
+Wanted: TypeAlias = ParamSet | Mapping[str, Settable]
+"""The wanted parameters: of a file or a snapshot, or plain values by name."""
 
 
 class PlanOptions(TypedDict, total=False):
@@ -250,7 +254,7 @@ class Plan(Rows):
 
 def plan_from(
     current: ParamSet | Mapping[str, Param],
-    wanted: ParamSet,
+    wanted: Wanted,
     *,
     autopilot: str | None = None,
     encoding: Encoding | None = None,
@@ -270,7 +274,7 @@ def plan_from(
 
     Args:
         current: the vehicle's parameters: a table, such as `component.params`, or a snapshot.
-        wanted: the wanted parameters.
+        wanted: the wanted parameters, or plain values by name.
         autopilot: "px4" or "ardupilot"; None if `current` names it, or to use the lists of both.
         encoding: the encoding of values; None for that of the autopilot.
         options: as in `PlanOptions`.
@@ -279,6 +283,8 @@ def plan_from(
         UsageError: an element of `include` is neither a category nor a glob; `current` and `wanted` are of
             different components or autopilots, or one has plain and the other extended parameters.
     """
+    if not isinstance(wanted, ParamSet):
+        wanted = ParamSet(wanted, is_extended=isinstance(current, ParamSet) and current.is_extended)
     return _Planner(current, wanted, autopilot, encoding, options).plan()
 
 

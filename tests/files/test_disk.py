@@ -61,7 +61,7 @@ def test_a_replaced_file_keeps_its_mode_and_a_symbolic_link_to_it(old: Path, tmp
     link.symlink_to(old)
     for path in (old, link):
         old.write_bytes(OLD)
-        write_file(path, PARAMS)
+        write_file(path, {"A": 5})
         assert read_file(old).choose()["A"].value == 5
         assert stat.S_IMODE(old.stat().st_mode) == 0o640
         assert listed(old.parent) == [old.name]

@@ -231,7 +231,7 @@ def test_values_are_compared_in_the_type_of_the_vehicle() -> None:
     assert plan_from(table, written(A=0.1, B=3.0, C=0, D=16777217, ODD=RAW), autopilot="px4").complete
     made = plan_from(table, written(A=0.1, D=16777216, ODD=RAW[::-1]), autopilot="px4")
     assert order(made) == [["D", "ODD"]]
-    assert plan_from(table, written(ODD=5)).rows["ODD"].status is ApplyStatus.REFUSED
+    assert plan_from(table, {"ODD": 5}).rows["ODD"].status is ApplyStatus.REFUSED
 
 
 def test_the_order_of_stages_works_on_ardupilot() -> None:
