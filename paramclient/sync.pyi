@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal, Self, Unpack
+from typing import Literal, Self, TypeAlias, Unpack
 
 from paramclient.cache import ParamCache
 from paramclient.client.client import COMPONENT_TIMEOUT, FetchedAll
@@ -14,7 +14,7 @@ from paramclient.links import Link
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.store import MetadataStore
 from paramclient.model.identity import Identity
-from paramclient.model.paramset import ParamMap
+from paramclient.model.paramset import ParamMap, ParamSet
 from paramclient.model.values import Encoding, Param, Settable
 from paramclient.protocol import ftp
 from paramclient.protocol.addresses import Address
@@ -165,6 +165,8 @@ class Component:
 
     def changes(self) -> Changes:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`."""
+
+Wanted: TypeAlias = ParamSet | Mapping[str, Settable]
 
 class Changes(Iterator[Change]):
     """Stream of the changes since its creation; see `Component.changes`."""
