@@ -51,6 +51,8 @@ HEARTBEAT: Final = message_id(messages.Heartbeat)
 FILE_TRANSFER: Final = message_id(messages.FileTransfer)
 HARMLESS: Final = frozenset({HEARTBEAT, message_id(messages.SystemTime), 4, 66, 111})
 """What passes from the stations of a read-only endpoint, with PING, REQUEST_DATA_STREAM and TIMESYNC."""
+COMMANDS: Final = frozenset({75, 76})
+"""COMMAND_INT and COMMAND_LONG: both have the command at byte 28."""
 HARMLESS_COMMANDS: Final = (messages.MAV_CMD_REQUEST_MESSAGE, messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
 HARMLESS_OPCODES: Final = {*Opcode} - {Opcode.CREATE_FILE, Opcode.WRITE_FILE, Opcode.OPEN_FILE_WO}
 """The requests of MAVFTP that write nothing."""
@@ -148,7 +150,8 @@ class Gateway:
                 return
         if not station.endpoint.is_readonly or _is_harmless(frame, message):
             self._pass(station, seen)
-            if getattr(message, "command", None) == messages.MAV_CMD_PREFLIGHT_STORAGE:
+            command = int.from_bytes(frame.payload[28:30], "little") if frame.message_id in COMMANDS else 0
+            if command == messages.MAV_CMD_PREFLIGHT_STORAGE:
                 for link in self.links:
                     for table in link.tables(_target_of(frame), COMP_ID_ALL, extended=False):
                         table.component.watch.doubt()  # it may reset all, which PX4 does not announce

@@ -1132,9 +1132,12 @@ async def test_a_silent_reset_by_a_station_is_found() -> None:
     model = small_px4()
     async with in_sync(model) as (_, _, station):
         await station.ask(set_to("PARAM_01", 9), seconds=3.0)
-        model.load({"PARAM_01": 1})
-        await station.ask(messages.CommandLong(1, 1, 245, 2.0), seconds=3.0)
-        assert by_name(station)["PARAM_01"] == struct.pack("<i", 1)
+        reset = struct.pack("<7fH2B", 2, 0, 0, 0, 0, 0, 0, 245, 1, 1)
+        for number, value in ((76, 1), (75, 2)):  # COMMAND_LONG, COMMAND_INT
+            model.load({"PARAM_01": value})
+            station.send_bytes(frames.build_frame(number, reset, system=255, component=190, sequence=value))
+            await station.ask(seconds=3.0)
+            assert by_name(station)["PARAM_01"] == struct.pack("<i", value)
 
 
 async def test_a_restart_during_a_list() -> None:
