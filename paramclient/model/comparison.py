@@ -148,7 +148,8 @@ def compare(
     chosen = left.keys() | right.keys()
     if names is not None:
         given = [names] if isinstance(names, str) else names
-        chosen = NameChoice(given).choose(chosen, " of either side")
+        lacks = "".join(f" ({each.source}: {each.lacks})" for each in (left, right) if each.lacks)
+        chosen = NameChoice(given).choose(chosen, f" of either side{lacks}")
     entries = []
     for name in sorted(chosen):
         ours, theirs, before = left.get(name), right.get(name), None if base is None else base.get(name)
