@@ -59,7 +59,7 @@ async def show(
             vehicle = f"cache:{summaries[0].key}"
         check_link(link_of(vehicle))
         found = read_source(vehicle, every=True, extended=extended, incomplete=True, cache=cache)
-        sets = [await resolve(vehicle, cache=False)] if found is None else found.sets
+        sets = [await resolve(vehicle, cache=False, incomplete=True)] if found is None else found.sets
     kept = choose_names(chosen, sets)
     views = []
     for whole, known in zip(sets, known_of_sets(sets, options, metadata), strict=True):

@@ -51,6 +51,7 @@ async def resolve(
     system: int | None = None,
     component: int | None = None,
     extended: bool = False,
+    incomplete: bool = False,
     cache: ParamCache | str | bool | None = None,
 ) -> ParamSet:
     """Return the parameters that a text names.
@@ -65,22 +66,26 @@ async def resolve(
         text: the file, the vehicle or the link.
         system, component: select a set of a file, a table of the cache, or a vehicle of the link.
         extended: extended parameters of a vehicle; a file with them needs no mention.
+        incomplete: also an incomplete table of the cache or of a link: `ParamSet.lacks` says what is missing.
         cache: as in `ParamClient`; False excludes vehicles of the cache.
 
     Raises:
         UsageError: the text names none of the three; a file, or a line of it, cannot be read (FileError).
         UnknownVehicle, AmbiguousVehicle, CacheError: as `tables_in`.
-        VehicleError: some parameters were not received; the message names them, or counts those in the cache.
+        VehicleError: without `incomplete`, some parameters were not received; the message names them, or
+            counts those in the cache.
         NoReply, LinkError: as from `ParamClient.component` and `Component.fetch_all`.
     """
-    read = partial(read_source, text, component=component, extended=extended, partial=False, cache=cache)
-    if (found := await anyio.to_thread.run_sync(read)) is not None:  # a log of 100 MB takes seconds
+    read = partial(read_source, text, component=component, extended=extended, incomplete=incomplete)
+    # in a thread, as a log of 100 MB takes seconds
+    if (found := await anyio.to_thread.run_sync(partial(read, partial=False, cache=cache))) is not None:
         return choose(found, component, system)
     link = link_of(text)
     async with ParamClient(link, cache=cache if link == text else False) as client:
         vehicle = await client.component(system, component)
         vehicle = vehicle.ext if extended else vehicle
-        return fetched_set(vehicle, await vehicle.fetch_all(), source=f"link {client.link.name}")
+        fetched, source = await vehicle.fetch_all(), f"link {client.link.name}"
+        return fetched_set(vehicle, fetched, source=source, partial=incomplete)
 
 
 def read_source(
@@ -269,11 +274,10 @@ def fetched_set(component: Component, result: FetchResult, *, source: str, parti
 
 def part_set(component: Component, params: Collection[Param], source: str, lacks: Iterable[str]) -> ParamSet:
     """Return a set that lacks these parameters, and those with a name that the client does not store."""
-    words = ""
-    if names := [*lacks, *map(repr, sorted(component.session.table.left_out))]:
-        kept = sum(param.index is not None for param in params)
-        words = f"{kept} of {component.count} parameters, without {first_of(names, NAMES_SHOWN_MAX)}"
-    return component_set(component, params, source, words)
+    names = [*lacks, *map(repr, sorted(component.session.table.left_out))]
+    kept = sum(param.index is not None for param in params)
+    words = f"{kept} of {component.count} parameters, without {first_of(names, NAMES_SHOWN_MAX)}"
+    return component_set(component, params, source, words if names else "")
 
 
 def _incomplete(what: str, system: int, component: int) -> VehicleError:
