@@ -340,7 +340,7 @@ class _Planner:
             rows,
             self.stages(rows),
             problems={
-                name: row.why
+                name: row.why if row.wanted.line is None else f"{row.why} (line {row.wanted.line})"
                 for name, row in rows.items()
                 if row.status is ApplyStatus.REFUSED
                 and not (row.category == MISSING and name.startswith(hidden))

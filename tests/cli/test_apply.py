@@ -112,8 +112,8 @@ def test_invalid_values_and_mistyped_names_are_reported_before_anything_is_sent(
     wrong = file(f"RTL_ALT,2500\n{line}\n")
     outcome = command("apply", put(vehicle), wrong)
     assert (outcome.code, vehicle.requests["PARAM_SET"]) == (2, 0)
-    said = [text in outcome.err for text in (fault, "--partial skips these", "writing to")]
-    assert said == [True, True, False]
+    said = [text in outcome.err for text in (fault, " (line 2)\n", "--partial skips these", "writing to")]
+    assert said == [True, True, True, False]
     would = command("apply", put(vehicle), wrong, "--dry-run")
     assert (would.code, "nothing would be sent without --partial: " in would.err) == (2, True)
     listed = command("apply", put(vehicle), wrong, "--json")
