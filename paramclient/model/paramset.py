@@ -154,7 +154,7 @@ class ParamSet(ByName[WrittenParam]):
         is_extended: bool = False,
         lacks: str = "",
     ) -> None:
-        written = {name: _written(name, value, is_extended) for name, value in params.items()}
+        written = {name: _written(name, value, is_extended) for name, value in dict(params).items()}
         given = (written, component, system, identity, at, source, is_extended, lacks)
         for attribute, content in zip(fields(self), given, strict=True):
             object.__setattr__(self, attribute.name, content)
