@@ -27,7 +27,7 @@ def param(name: str, value: Value, kind: int = ParamType.REAL32, default: Value 
 def test_plain_values_have_names_that_a_parameter_can_have() -> None:
     wrong: tuple[Any, ...] = (5, *({"A": 1, name: 1} for name in (1, None, "", "SEVENTEEN_LETTERS", "ÄÖÜ")))
     for each in wrong:
-        with pytest.raises((UsageError, TypeError), match="parameter name|not iterable"):
+        with pytest.raises((UsageError, TypeError), match=r"parameter name|not iterable"):
             ParamSet(each)
 
 
