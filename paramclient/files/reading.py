@@ -164,7 +164,7 @@ class Reading:
             raise FileError("the file contains no parameters", source=self.source)
         self.notes += [f"{each}; left out." for each in told]
         known = [line.removeprefix(LACKS) for line in header if line.startswith(LACKS)]
-        known += [f"without {counted(self.fault_count, 'line')} that cannot be read"] if told else []
+        known += [f"without {counted(self.fault_count, 'parameter')} that cannot be read"] if told else []
         sets = tuple(replace(each, lacks="; ".join(filter(None, (each.lacks, *known)))) for each in sets)
         if (more := self._repeated - FAULTS_MAX) > 0:
             self.notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")

@@ -197,10 +197,10 @@ def test_a_name_that_no_vehicle_has_is_left_out(command: Command, write: Write) 
     left, right = write("left.param", "A,1", "SIM_GPS1_BYTELOSS,0"), write("right.param", "A,1")
     for words in (["diff", left, right], ["show", left]):
         outcome = command(*words)
-        assert (outcome.code, "(incomplete: without 1 line that" in outcome.err) == (0, True)
+        assert (outcome.code, "(incomplete: without 1 parameter that" in outcome.err) == (0, True)
         assert all(each in outcome.err.splitlines()[0] for each in ("left.param: line 2: ", "_BYTELOSS"))
     assert command("save", left, "new.param").code == 0
-    assert "(incomplete: without 1 line that" in command("show", "new.param").err
+    assert "(incomplete: without 1 parameter that" in command("show", "new.param").err
 
 
 def test_a_file_is_read_from_the_standard_input(

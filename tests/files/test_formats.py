@@ -436,7 +436,7 @@ def test_a_fault_of_the_whole_file_is_an_error_also_on_request_of_a_part() -> No
     for text in ("bad\nbad\n", "A,1\n@include missing.param\n", "<html>\nA = 1\n", document):
         assert failed(text, partial=True)
     more = loads(b"A,1\n" + b"bad\n" * 50, partial=True)
-    assert (more.left_out, len(more.notes), more.choose().lacks[:17]) == (50, 21, "without 50 lines ")
+    assert (more.left_out, len(more.notes), more.choose().lacks[:15]) == (50, 21, "without 50 para")
 
 
 # Format detection
