@@ -225,7 +225,7 @@ class KeptTable(Stream[Change]):
     @property
     def withholds(self) -> bool:
         """Whether values of the component are answers to the gateway: it announces changes itself."""
-        return self.session.table.is_complete or self.is_loading
+        return self.session.table.is_complete or self.is_loading or bool(self._reads or self._sets)
 
     @property
     def state_key(self) -> object:

@@ -327,8 +327,7 @@ async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_befor
 
 @pytest.mark.parametrize("author", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
 async def test_an_author_must_be_printable_ascii(path: Path, author: str) -> None:
-    vehicle = small_px4()
-    async with connected(vehicle, cache=path) as (_, component):
+    async with connected(small_px4(), cache=path) as (_, component):
         with pytest.raises(errors.UsageError, match="author must have 1 to 128 printable ASCII"):
             await component.set("PARAM_01", 100, author=author)
         with pytest.raises(errors.UsageError, match="author must have"):
@@ -432,8 +431,7 @@ def said(path: Path) -> tuple[int, bool | None]:
 
 async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Path) -> None:
     vehicle = ArduPilotVehicle(live_period=0)
-    result = await session(vehicle, path)
-    defaults = {name: param.default for name, param in result.params.items()}
+    defaults = {name: param.default for name, param in (await session(vehicle, path)).params.items()}
     assert said(path) == (1382, True)
     async with connected(vehicle, cache=path) as (_, component):
         assert {name: param.default for name, param in component.params.items()} == defaults
@@ -530,8 +528,7 @@ TABLE: dict[str, int | float | str | bytes] = {"CAM_MODE": 1, "CAM_NAME": "Front
 
 
 def kept_of_camera(path: Path) -> dict[str, object]:
-    params = table_in(path, component=100, extended=True).params
-    return {name: param.value for name, param in params.items()}
+    return {each.name: each.value for each in table_in(path, component=100, extended=True).params.values()}
 
 
 async def test_the_next_session_knows_extended_parameters(tmp_path: Path) -> None:

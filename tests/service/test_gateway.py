@@ -239,13 +239,16 @@ async def test_rule_2_extended_parameters() -> None:
     wanted = answers_of(Camera(), messages.ParamExtValue, messages.ParamExtRequestList(1, 100))
     async with gateway_over(camera) as served:
         await served.clients[0].component(1, 100)
-        station = served.partner()
+        station, other, one = served.partner(), served.partner(system=9), wanted[2]
+        other.send(GCS)
+        same = messages.ParamExtSet(1, 100, one.param_id, one.raw, one.param_type)
+        await station.ask(same, seconds=3.0)  # before any list
+        assert (len(station.of(messages.ParamExtAck)), other.of(messages.ParamExtAck)) == (1, [])
         await station.ask(messages.ParamExtRequestList(1, 100), seconds=5.0)
         assert station.of(messages.ParamExtValue) == wanted
         camera.received.clear()
         await station.ask(messages.ParamExtRequestList(1, 100))
         assert station.of(messages.ParamExtValue) == wanted
-        one = wanted[2]
         reads = ((one.param_id, -1), ("", 2))
         await station.ask(*(messages.ParamExtRequestRead(1, 100, *each) for each in reads))
         assert station.of(messages.ParamExtValue) == [one, one]
