@@ -460,7 +460,7 @@ class KeptTable(Stream[Change]):
         return ParamErrorCode.NO_ERROR
 
     def _say(self, askers: Iterable[Asker], message: Message) -> None:
-        for asker in askers:
+        for asker in () if self.is_lost else askers:
             asker.station.say(message, self.source)
 
     def _reject(self, askers: Iterable[Asker], key: SetKey, code: int) -> None:

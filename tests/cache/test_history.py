@@ -81,8 +81,7 @@ def test_zero_and_negative_zero_are_one_value(cache: ParamCache) -> None:
 
 
 def test_every_observation_of_one_update_counts(cache: ParamCache) -> None:
-    items = [stored("A", value, at=NOW + value, by="us") for value in (1, 2, 3)]
-    cache.save(update(*items, at=NOW + 3))
+    cache.save(update(*(stored("A", value, at=NOW + value, by="us") for value in (1, 2, 3)), at=NOW + 3))
     assert lines(cache) == [(2, "A", 1, 2, "us"), (3, "A", 2, 3, "us")]
 
 

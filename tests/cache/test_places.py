@@ -149,8 +149,7 @@ def test_several_processes_write_to_one_new_place(place: str) -> None:
 
 
 def test_an_unreachable_database_is_an_error_without_the_password(tmp_path: Path) -> None:
-    url = f"postgresql://me:se%20cret@/fleet?host={tmp_path}"
-    with ParamCache(url) as cache:
+    with ParamCache(f"postgresql://me:se%20cret@/fleet?host={tmp_path}") as cache:
         assert "cret" not in cache.place
         for _ in range(2):  # the second call fails at once
             with pytest.raises(CacheError, match="cannot be used") as caught:

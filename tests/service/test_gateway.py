@@ -289,8 +289,7 @@ async def test_rule_2_the_parameter_file_in_the_requested_pieces(size: int, quer
         assert max(map(len, station.datagrams)) <= 1_400
         pack = decode(direct_file(path, size))
         rows = [each._replace(default=None) if each.default == each.bits else each for each in pack.entries]
-        wanted = encode(rows, total=pack.total, with_defaults=pack.with_defaults, read_size=size)
-        assert content == wanted
+        assert content == encode(rows, total=pack.total, with_defaults=pack.with_defaults, read_size=size)
         await station.ask_file(Opcode.OPEN_FILE_RO, data=path.encode(), session=4)
         await station.ask_file(Opcode.TERMINATE_SESSION, session=4)
         [part] = await station.ask_file(Opcode.READ_FILE, offset=size, size=size, session=3)
@@ -408,8 +407,7 @@ async def test_rule_3_a_list_that_is_asked_during_the_fetch_streams_it() -> None
         await until(lambda: component.sync_state == "synced")
         await anyio.sleep(1.0)
         for each in stations:
-            values = each.of(ParamValue)
-            indices = [value.param_index for value in values if value.param_id != "_HASH_CHECK"]
+            indices = [value.param_index for value in each.of(ParamValue) if value.param_id != "_HASH_CHECK"]
             assert sorted(set(indices)) == list(range(component.count or 0))
             assert first_value_at(each) - began <= 2.0
         assert len(vehicle.messages(ParamRequestList)) <= 5  # of the gateway alone
@@ -526,8 +524,7 @@ async def test_rule_3_cached_values_are_never_served(tmp_path: Path) -> None:
         pass
     vehicle = Tap(small_px4())
     async with gateway_over(vehicle, cache=cache) as served:
-        component = await served.clients[0].component()
-        assert {each.trust for each in component.params.values()} == {"cached"}
+        assert {each.trust for each in (await served.clients[0].component()).params.values()} == {"cached"}
         vehicle.is_deaf = True
         station = served.partner()
         await station.ask(LIST, ParamRequestRead(1, 1, "PARAM_01", -1), seconds=2.0)
@@ -700,13 +697,18 @@ async def test_rule_4_an_error_within_3_seconds_during_the_fetch_by_a_vehicle_th
 
 async def test_rule_4_an_error_within_3_seconds_during_the_fetch_by_a_camera_too() -> None:
     vehicle = Tap(Camera(burst=1, period=1.0))
+    write = messages.ParamExtSet(1, 100, "CAM_NAME", bytes(128), ParamType.CUSTOM)
     async with gateway_over(vehicle) as served:
         await served.clients[0].component(1, 100)
         station = served.partner()
         await station.ask(messages.ParamExtRequestList(1, 100), seconds=2.0)
         vehicle.is_deaf = True
-        await station.ask(messages.ParamExtSet(1, 100, "CAM_NAME", bytes(128), ParamType.CUSTOM), seconds=3.0)
+        await station.ask(write, seconds=3.0)
         assert [each.param_result for each in station.of(messages.ParamExtAck)] == [2]
+        vehicle.is_mute = True
+        await anyio.sleep(3.5)
+        await station.ask(write, seconds=3.0)  # the camera is lost before an error is due
+        assert not station.frames
 
 
 # 5: changes
