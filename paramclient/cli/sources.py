@@ -311,7 +311,7 @@ def _summary(found: JsonObject) -> str:
 def described(params: ParamSet) -> str:
     """Return a set in words: `903 parameters of 1/1 px4 from link sim:px4, 2026-11-20T18:00:00.000Z`."""
     origin = [
-        "" if params.component is None and params.system is None else f"of {address(params)}",
+        "" if params.component is None else f"of {address(params)}",
         params.autopilot,
         f"from {params.source}" if params.source else "",
     ]
