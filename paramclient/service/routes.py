@@ -362,7 +362,7 @@ async def fetch(target: TargetArgument, body: FetchRequest) -> JsonObject:
 
 @reading.post("/api/files")
 async def read_file(body: UploadedFile) -> dict[str, Any]:
-    """Parse a parameter file of any format, without names that no vehicle can have. It is not stored."""
+    """Parse a parameter file of any format, without lines that cannot be read. It is not stored."""
     file = await anyio.to_thread.run_sync(partial(body.read, partial=True))
     sets = [json_output.set_json(each) for each in file.sets]
     return {"file": file.source, "format": file.file_format, "notes": file.notes, "components": sets}
