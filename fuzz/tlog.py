@@ -106,7 +106,9 @@ def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Se
             (spelt, kind, bits_of(decode_value(raw, kind, encoding)[0], kind))
             for (_, component), each in said.items()
             if component == summary.component
-            for name, kind, raw in each
+            for name, own, raw in each
+            # ArduPilot acknowledges some sets as REAL32, which are stored in the known type
+            for kind in {own, *(other for known, other, _ in each if known == name and own == KINDS[0])}
             for spelt in (name, name.translate(_CAPITALS))  # names of ArduPilot are stored in capitals
             for encoding in Encoding
         }
