@@ -113,8 +113,7 @@ def test_an_update_with_an_invalid_time_writes_nothing(cache: ParamCache) -> Non
 
 def test_another_firmware_has_other_defaults(cache: ParamCache) -> None:
     param = Param("A", 1, ParamType.INT32, 0, 1, default=3)
-    state = TableState(None, 1, complete=True, file_works=True)
-    cache.save(update(StoredParam.of(param, NOW), table=state))
+    cache.save(update(StoredParam.of(param, NOW), table=TableState(None, 1, complete=True, file_works=True)))
     cache.save(update(at=NOW + 1, identity=replace(PX4, firmware=5)))
     table = cache.component("1")
     assert (table.params["A"].default, table.file_works) == (None, None)

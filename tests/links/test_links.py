@@ -262,8 +262,7 @@ async def test_udpin_sends_to_every_known_vehicle() -> None:
             sent = {one: frame(1), two: frame(1)[7:] + frame(2), odd: bytes(600) + frame(2)}
             for sock, data in sent.items():
                 sock.send(data)
-            received = dict(await collect(link, 3))
-            assert received == {sock.getsockname(): data for sock, data in sent.items()}
+            assert dict(await collect(link, 3)) == {sock.getsockname(): data for sock, data in sent.items()}
             await link.send(frame(3), None)
             await link.send(frame(4), two.getsockname())
             assert one.recv(1000) == frame(3)

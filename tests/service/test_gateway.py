@@ -490,25 +490,25 @@ async def test_rule_3_the_hash_is_answered_in_under_a_second_before_the_table_is
         assert not (await served.clients[0].component()).session.table.is_complete
 
 
-async def test_rule_3_no_value_is_served_while_its_encoding_is_in_doubt() -> None:
-    """The first heartbeat of an ArduPilot may wait behind a list; its 120.0 read as an INT16 is 0."""
-    float_120 = struct.pack("<f", 120)
-    values = [ParamValue(f"INT_{index}", float_120, ParamType.INT16, 2, index) for index in range(2)]
+@pytest.mark.parametrize(("autopilot", "raw"), [(3, struct.pack("<f", 120)), (12, struct.pack("<i", 120))])
+async def test_rule_3_no_value_is_served_while_its_encoding_is_in_doubt(autopilot: int, raw: bytes) -> None:
+    """The first heartbeat may wait behind a list; 120.0 of an ArduPilot is another number byte by byte."""
+    values = [ParamValue(f"INT_{index}", raw, ParamType.INT32, 2, index) for index in range(2)]
     vehicle = Puppet(lambda message: values * isinstance(message, ParamRequestList), heartbeat=None)
     async with gateway_over(vehicle) as served:
         station = served.partner()
         station.send(GCS)
         vehicle.say(values[0])
-        write = ParamSet(1, 1, "INT_0", float_120, ParamType.INT16)
+        write = ParamSet(1, 1, "INT_0", raw, ParamType.INT32)
         for _ in range(10):
             await station.ask(LIST, ParamRequestRead(1, 1, "", 0), write, seconds=1.0)
-            assert {each.raw for each in station.of(ParamValue)} <= {float_120}
-        assert {each.raw for each in vehicle.received if isinstance(each, ParamSet)} <= {float_120}
+            assert {each.raw for each in station.of(ParamValue)} <= {raw}
         for _ in range(6):
-            vehicle.say(messages.Heartbeat(2, 3))
+            vehicle.say(messages.Heartbeat(2, autopilot))
             await station.ask(LIST, seconds=1.0)
+        assert {each.raw for each in vehicle.received if isinstance(each, ParamSet)} == {raw}
         found = {(each.raw, each.param_index) for each in station.of(ParamValue)}
-        assert found == {(float_120, 0), (float_120, 1)}
+        assert found == {(raw, 0), (raw, 1)}
 
 
 async def test_rule_3_a_list_with_a_name_that_is_not_stored_is_the_vehicles() -> None:
@@ -560,6 +560,8 @@ async def test_rule_3_a_component_without_heartbeats_is_lost_after_a_minute() ->
             await anyio.sleep(seconds)
             await station.ask(messages.ParamExtRequestRead(1, 100, "A", -1))
             assert len(station.of(messages.ParamExtValue)) == answers, seconds
+            await station.ask(messages.ParamExtSet(1, 100, "A", bytes(128), ParamType.UINT8), seconds=3.0)
+            assert len(station.of(messages.ParamExtAck)) == answers, seconds
 
 
 async def test_rule_3_a_vehicle_that_is_lost_during_the_fetch_is_served_when_it_is_back() -> None:
