@@ -159,7 +159,9 @@ async def _ask(
     received: ReportedValue = await channel.exchange(
         request, inbox, accept, what=what, attempts=attempts_max, timeout_min=wait, copies=copies
     )
-    session.serves_reads[type(which)] = True
+    is_of_other = isinstance(which, str) and (session.only_by_index or which in session.sent)
+    if None not in session.reading and not is_of_other:  # it may be of the list, of a read by index, of a set
+        session.serves_reads[type(which)] = True
     return received
 
 
@@ -241,14 +243,16 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
     same = live.pop(which, None) if isinstance(which, str) else None
     known: Iterable[str | int | None] = live.values() if _reads_by_index(session) else [*live]
     likely: str | int = next((each for each in known if each), 1) if same is None else same
-    control = await _try(session, likely) or await _try(session, 0)  # the indices may be 0, 2, 4, …
-    is_proven = not isinstance(which, str) or session.serves_reads.get(str)
-    if control is None or is_proven or control.param_id == which:
-        return control
-    await anyio.sleep(session.channel.timing.timeout(0))  # its other answers would be taken for one by name
-    by_name = await _try(session, control.param_id)
-    session.only_by_index = by_name is None
-    return by_name
+    async with session.control:
+        control = await _try(session, likely) or await _try(session, 0)  # the indices may be 0, 2, 4, …
+        served = session.serves_reads
+        if control is None or not isinstance(which, str) or served.get(str) or control.param_id == which:
+            return control
+        if str not in served:
+            await anyio.sleep(session.channel.timing.timeout(0))  # for its other answers
+            await _try(session, control.param_id)
+        session.only_by_index = not served.get(str)
+        return None if session.only_by_index else control
 
 
 async def _try(session: Session, which: str | int) -> ReportedValue | None:
@@ -262,7 +266,8 @@ async def _try(session: Session, which: str | int) -> ReportedValue | None:
     requests = max(channel.timing.attempts_for(CONTROL_LOST), CONTROL_REQUESTS_MIN)
     with channel.inbox((session.dialect.value, which)) as inbox:
         try:
-            return await _ask(session, inbox, which, requests)
+            answer = await _ask(session, inbox, which, requests)
+            return answer if session.serves_reads.get(type(which)) else None
         except (NoReply, VehicleError):
             session.serves_reads.setdefault(type(which), False)
             return None
@@ -278,8 +283,7 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
         LinkError: the link is closed for good.
     """
     answers: list[ReportedValue] = []
-    failures: list[ParamClientError] = []
-    has_gap = True
+    has_gap: bool | None = None
 
     async def take() -> None:
         while not answers:
@@ -288,21 +292,17 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
                 answers.append(message)
         tasks.cancel_scope.cancel()
 
-    async with anyio.create_task_group() as tasks:
+    async with task_group() as tasks:
         tasks.start_soon(take)
-        try:
+        with suppress(NoReply):
             for _ in range(1 + session.listing.is_running):  # one that runs may have passed the parameter
                 has_gap = (await session.listing.join(lambda: download_list(session))).has_gap
-        except ParamClientError as error:
-            failures.append(error)
         tasks.cancel_scope.cancel()
-    if not failures:
+    if answers or has_gap is not None:
         session.serves_reads.setdefault(type(which), False)
     if answers:
         return answers[0]
-    if failures and not isinstance(failures[0], NoReply):
-        raise failures[0]
-    if session.channel.is_lost or has_gap:
+    if session.channel.is_lost or has_gap is not False:
         return None
     sent = f": its list has {len(session.table.names)} of {session.table.count} parameters"
     raise _unknown(session, which, sent * (not session.table.is_complete))

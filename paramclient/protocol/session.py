@@ -154,6 +154,7 @@ class Session:
         contradicted: called when a hash is received that is not the table's.
         serves_reads: whether reads by name (str), and by index (int), are answered, as far as known.
         only_by_index: whether reads by index were answered, and reads by name of the same were not.
+        control: taken for the reads that decide this: the answer to another one would be taken for theirs.
         listing: the list that is downloaded in place of reads that are not answered.
         seeking: the reads for evidence of the encoding.
         acknowledging: names whose next value may acknowledge a set, in another type than the parameter's.
@@ -187,6 +188,7 @@ class Session:
         self.contradicted: Callable[[], None] = lambda: None
         self.serves_reads: dict[type[str | int], bool] = {}
         self.only_by_index = False
+        self.control = anyio.Lock()
         self.listing: Shared[Any] = Shared(spawn, channel.gate)
         self.seeking: Shared[None] = Shared(spawn, channel.gate)
         self.acknowledging: set[str] = set()
