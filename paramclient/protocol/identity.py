@@ -239,22 +239,19 @@ class Identification:
             return False
 
         def request_of(attempt: int) -> messages.CommandLong:
-            is_second = ways[0].command in refused or (attempt >= 2 and attempt % 2 == 1)
-            return ways[is_second]
+            return ways[ways[0].command in refused or (attempt >= 2 and attempt % 2 == 1)]
 
         with channel.inbox(*keys) as inbox, suppress(NoReply):
-            attempts = VERSION_ATTEMPTS_MAX
             while len(refused) < len(ways):
                 if await channel.exchange(
                     request_of,
                     inbox,
                     accept,
                     what="AUTOPILOT_VERSION",
-                    attempts=attempts,
+                    attempts=VERSION_ATTEMPTS_REFUSED if refused else VERSION_ATTEMPTS_MAX,
                     copies=lambda attempt: VERSION_COPIES if attempt else 1,
                 ):
                     return
-                attempts = VERSION_ATTEMPTS_REFUSED
         self.settle()
 
     def _derive(self) -> None:

@@ -44,8 +44,10 @@ SETS_LOST: Final = 1e-4
 """Probability that all sets are lost, at which a vehicle that keeps the old value has not applied them."""
 QUEUE_WAITS: Final = 3
 """Waits for the wanted value, each as long as an answer ever took, while older ones still arrive."""
-EVIDENCE_READS: Final = 8
+EVIDENCE_MAX: Final = 32
 """Indices that are read for evidence of the encoding: few components begin with more zeros and floats."""
+EVIDENCE_READS: Final = 8
+"""Those that are read at once: mostly, they suffice."""
 EXT_PROGRESS_TIMEOUT: Final = 60.0
 """Seconds for a component that reports progress to finish: a camera formats a card meanwhile."""
 EXT_PROGRESS_READ: Final = 2.0
@@ -462,12 +464,14 @@ async def _known(session: Session, name: str) -> Param:
 
 async def _seek_evidence(session: Session) -> None:
     """Read the first values of the list, until one shows the encoding or all had time to be answered."""
-    channel, evidence = session.channel, session.table.evidence
+    channel, table = session.channel, session.table
     with channel.inbox(session.dialect.value) as inbox:
-        sent, seconds = anyio.current_time(), queue_time(session, EVIDENCE_READS)
-        for index in range(EVIDENCE_READS):
-            channel.send(session.dialect.request_read(channel.reads_from, index))
-        await channel.wait_for(inbox, lambda message: evidence or None, sent, 0, seconds)
+        for first in range(0, min(EVIDENCE_MAX, table.count or EVIDENCE_MAX), EVIDENCE_READS):
+            sent, seconds = anyio.current_time(), queue_time(session, EVIDENCE_READS)
+            for index in range(first, first + EVIDENCE_READS):
+                channel.send(session.dialect.request_read(channel.reads_from, index))
+            if await channel.wait_for(inbox, lambda message: table.evidence or None, sent, 0, seconds):
+                return
 
 
 def _check_finite(session: Session, name: str, value: Value, *, force: bool) -> None:

@@ -88,6 +88,7 @@ async def test_an_acknowledgement_in_another_type_changes_neither_the_type_nor_t
             ]
 
 
+FORTY = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
 COUNTS: dict[str, Callable[[int], int]] = {
     "right": lambda index: 40,
     "growing": lambda index: index + 1,
@@ -109,8 +110,7 @@ COUNTS: dict[str, Callable[[int], int]] = {
 async def test_odd_indices_and_counts_make_a_complete_table(
     serves: tuple[str, ...], loss: float, count: str, first: int, heartbeat: messages.Heartbeat
 ) -> None:
-    table = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
-    vehicle = Partial(table, serves=serves, count=COUNTS[count], first=first, heartbeat=heartbeat)
+    vehicle = Partial(FORTY, serves=serves, count=COUNTS[count], first=first, heartbeat=heartbeat)
     async with talking(Air.symmetric([vehicle], loss=loss, seed=5)) as (conversation, session):
         result = await fetch_all(session)
         assert (result.complete, len(result.params), result.count, result.missing) == (True, 40, 40, ())
@@ -129,9 +129,8 @@ async def test_odd_indices_and_counts_make_a_complete_table(
 async def test_a_growing_count_is_never_complete_without_its_end(
     loss: float, serves: tuple[str, ...]
 ) -> None:
-    table = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
     for seed in range(12):
-        vehicle = Partial(table, serves=serves, count=lambda index: index + 1)
+        vehicle = Partial(FORTY, serves=serves, count=lambda index: index + 1)
         async with talking(Air.symmetric([vehicle], loss=loss, seed=seed)) as (_, session):
             result = await fetch_all(session)
             assert not result.complete or len(result.params) == 40
@@ -153,6 +152,13 @@ async def test_a_list_of_firmware_without_reads_is_requested_until_it_is_complet
     vehicle = Partial(serves=("list",), heartbeat=QUIET)
     async with talking(Air.symmetric([vehicle], delay=0.01, loss=0.2, seed=seed)) as (_, session):
         assert (await fetch_all(session)).missing == ()
+
+
+@pytest.mark.parametrize("seed", range(8))
+async def test_many_are_set_at_once_where_no_name_is_read(seed: int) -> None:
+    vehicle = Partial(FORTY, serves=("list", "indices", "sets", "acks", "commands"))
+    async with talking(Air.symmetric([vehicle], delay=0.05, loss=0.1, seed=seed)) as (_, session):
+        assert (await write_many(session, [(name, 4) for name in FORTY])).counts == {SetStatus.ACCEPTED: 40}
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -192,22 +198,19 @@ async def test_names_in_lower_case_are_found_whatever_the_autopilot(
 
 @pytest.mark.parametrize("name", ["RC MAP", "A,B", "42", "\xff\x01"])
 async def test_a_name_that_no_file_can_hold_is_noted_and_not_missed(name: str) -> None:
-    vehicle = Partial({**TABLE, name: (1.0, ParamType.REAL32)})
-    async with talking(vehicle) as (_, session):
+    async with talking(Partial({**TABLE, name: (1.0, ParamType.REAL32)})) as (_, session):
         result = await fetch_all(session)
         assert (result.missing, set(result.params)) == ((), set(TABLE))
         assert any(repr(name) in note for note in result.notes)
 
 
 @pytest.mark.parametrize("first", [0, 1])
-@pytest.mark.parametrize("too_many", [0, 2])
+@pytest.mark.parametrize("count", [2, 4])
 async def test_a_name_that_an_ardupilot_without_reads_does_not_list_is_unknown(
-    first: int, too_many: int
+    first: int, count: int
 ) -> None:
     table = {"abc_def": (5.0, ParamType.REAL32), "ghi": (1.0, ParamType.REAL32)}
-    vehicle = Partial(
-        table, serves=("list",), first=first, count=lambda index: 2 + too_many, heartbeat=ARDUPILOT
-    )
+    vehicle = Partial(table, serves=("list",), first=first, count=lambda index: count, heartbeat=ARDUPILOT)
     async with talking(vehicle) as (_, session):
         with pytest.raises(errors.UnknownParameter, match=r"1/1 has no ABC_DEF; did you mean abc_def"):
             await read(session, "ABC_DEF")
@@ -262,7 +265,7 @@ async def test_a_listed_value_is_taken_before_the_end(
 async def test_integers_in_another_encoding_are_told_and_not_written(
     heartbeat: messages.Heartbeat, capabilities: int | None, encoding: Encoding, name: str
 ) -> None:
-    table = {"ZERO": (0, ParamType.INT32), **TABLE}
+    table = {"ZERO": (0, ParamType.INT32), **dict.fromkeys("ABCDEFGH", (0.0, ParamType.REAL32)), **TABLE}
     version = None if capabilities is None else messages.AutopilotVersion(capabilities, uid=7)
     vehicle = Partial(table, heartbeat=heartbeat, encoding=encoding, version=version)
     async with talking(vehicle) as (_, session):
@@ -283,8 +286,7 @@ async def test_right_encodings_are_not_doubted() -> None:
     for heartbeat, encoding in ((ARDUPILOT, Encoding.C_CAST), (QUIET, Encoding.BYTEWISE)):
         large = 2**24 if encoding is Encoding.C_CAST else 2**31 - 1
         table = {**TABLE, "LARGE": (large, ParamType.INT32), "ID": (1_310_988, ParamType.INT32)}
-        vehicle = Partial(table, heartbeat=heartbeat, encoding=encoding)
-        async with talking(vehicle) as (_, session):
+        async with talking(Partial(table, heartbeat=heartbeat, encoding=encoding)) as (_, session):
             await fetch_all(session)
             assert not session.encoding_doubt
 
