@@ -245,13 +245,13 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
     likely: str | int = next((each for each in known if each), 1) if same is None else same
     async with session.control:
         control = await _try(session, likely) or await _try(session, 0)  # the indices may be 0, 2, 4, …
-        served = session.serves_reads
-        if control is None or not isinstance(which, str) or served.get(str) or control.param_id == which:
+        is_proven = not isinstance(which, str) or session.serves_reads.get(str)
+        if control is None or is_proven or control.param_id == which:
             return control
-        if str not in served:
+        if str not in session.serves_reads:
             await anyio.sleep(session.channel.timing.timeout(0))  # for its other answers
             await _try(session, control.param_id)
-        session.only_by_index = not served.get(str)
+        session.only_by_index = not session.serves_reads.get(str)
         return None if session.only_by_index else control
 
 
