@@ -277,8 +277,7 @@ class Target:
     def outcome(self, found: SetOutcome) -> JsonObject:
         """Return the outcome of a write as JSON."""
         known = self.component.params.get(found.name)
-        kind = ParamType.REAL64 if known is None else known.type
-        return outcome_json(found, kind, self.info(found.name))
+        return outcome_json(found, ParamType.REAL64 if known is None else known.type, self.info(found.name))
 
     async def values(self, given: Mapping[str, Scalar], *, force: bool = True) -> dict[str, Value]:
         """Return the values of a request; with `force`, they may be outside the range in the metadata.

@@ -154,8 +154,7 @@ def whole_list(session: Session) -> list[ReportedValue]:
 def known_param(session: Session, name: str | None) -> Param | None:
     """Return a parameter whose value is known to be the vehicle's."""
     param = None if name is None else session.table.params.get(name)
-    is_known = param is not None and param.trust is not Trust.CACHED and is_decoded(session)
-    return param if is_known else None
+    return param if param is not None and param.trust is not Trust.CACHED and is_decoded(session) else None
 
 
 def is_decoded(session: Session) -> bool:
