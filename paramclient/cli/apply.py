@@ -32,7 +32,7 @@ from paramclient.provision.apply_rules import CATEGORIES, READ_ONLY
 from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
 from paramclient.provision.execution import run as run_apply
 from paramclient.provision.inspection import plan, wait_for_identity
-from paramclient.provision.planning import MISSING, ApplyRow, ApplyStatus, Plan, Rows
+from paramclient.provision.planning import ApplyRow, ApplyStatus, Plan, Rows
 from paramclient.provision.sources import NO_DEFAULTS, choose, is_file, read_source
 
 _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be revealed"}
@@ -78,7 +78,7 @@ async def apply(
     All or nothing: with an invalid value, or a name that the vehicle does not have, nothing is written (exit
     code 2), unless --partial is given. The previous state is stored in the cache, for `restore`. On a
     terminal, the changes are shown and must be confirmed. Exit code 0: the vehicle has all values of the
-    file. Exit code 1: some values differ; 2: the vehicle lacks a name. After an interruption, run the same
+    file. Exit code 1: some values differ; 2: the file has a fault. After an interruption, run the same
     command again to continue. If several vehicles are heard, --vehicle must choose one, or all.
 
     Left out are actions, and by default the categories identity, hardware, calibration, measured, counter,
@@ -426,7 +426,7 @@ class _Job:
         else:
             say(f"{session.receiver}: {words or 'nothing acknowledged'}; {self.state.to_continue}")
             return code
-        if any(found.rows[name].category == MISSING for name in made.problems):
+        if made.problems:
             code = max(code, ExitCode.USAGE)
         if not session.options.json:
             say(f"{session.receiver}: {words or 'nothing to set'}{end}")
