@@ -49,7 +49,7 @@ LISTENING_TIME: Final = HEARTBEAT_WAIT
 """Seconds after the client was opened in which components are waited for, by a fetch of all."""
 SILENT_TIME: Final = 2.95
 """Seconds from the begin for a component that has never answered a request, where another one on the link
-answers: it costs no more than 3 s."""
+answers: it costs no more than 3 s. An ArduPilot or PX4 has parameters, and may still be starting."""
 EVENTS_MAX: Final = 1_000
 """Queued events for a consumer, at most."""
 
@@ -411,7 +411,7 @@ class ParamClient:
 
         The fetches run in parallel. Components that appear within 1.2 s after the client was opened are
         included. A component that does not respond is given up; it may have no parameters. Where another
-        component responds, that takes 3 s.
+        component responds, that takes 3 s, but not of an ArduPilot or PX4, which may be starting.
 
         Args:
             system: fetch only this system; None for all.
@@ -458,7 +458,8 @@ class ParamClient:
             await anyio.sleep_until(began + SILENT_TIME)
             if any(each.node.channel.answered.is_set() for each in chosen.values()):
                 for address, each in chosen.items():
-                    if each.count is None and not each.node.channel.answered.is_set():
+                    has_parameters = each in self.autopilots and each.autopilot in ("ardupilot", "px4")
+                    if each.count is None and not (has_parameters or each.node.channel.answered.is_set()):
                         scopes[address].cancel()
 
         async with task_group() as tasks:

@@ -285,7 +285,7 @@ class Channel:
 
     Attributes:
         target: the component's address.
-        reads_from: where reads and lists are sent to: the address, or all components of the system.
+        reads_from: where reads and lists are sent to: the address, or the autopilot of the system.
         send: queues a message for the component.
         timing: round trip and loss.
         window: limits the reads in flight; it follows what the vehicle serves.

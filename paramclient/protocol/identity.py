@@ -12,7 +12,7 @@ import anyio
 from paramclient.errors import CommandResult, NoReply
 from paramclient.model.identity import Identity, commit_text, hardware_id
 from paramclient.model.values import Encoding
-from paramclient.protocol.channel import Channel
+from paramclient.protocol.channel import FIRST_TIMEOUT, Channel
 from paramclient.wire import messages
 from paramclient.wire.frames import enum_word
 from paramclient.wire.messages import Message, message_id
@@ -250,6 +250,7 @@ class Identification:
                     what="AUTOPILOT_VERSION",
                     attempts=VERSION_ATTEMPTS_REFUSED if refused else VERSION_ATTEMPTS_MAX,
                     copies=lambda attempt: VERSION_COPIES if attempt else 1,
+                    timeout_min=FIRST_TIMEOUT,  # for 2 s, as the vehicle may write to its flash
                 ):
                     return
         self.settle()

@@ -159,8 +159,8 @@ async def _ask(
     received: ReportedValue = await channel.exchange(
         request, inbox, accept, what=what, attempts=attempts_max, timeout_min=wait, copies=copies
     )
-    is_of_other = isinstance(which, str) and (session.only_by_index or which in session.sent)
-    if None not in session.reading and not is_of_other:  # it may be of the list, of a read by index, of a set
+    # Else it may be of the list, the acknowledgement of a set, or the answer to a read by index.
+    if not (session.only_by_index or None in session.reading or which in session.sent):
         session.serves_reads[type(which)] = True
     return received
 

@@ -109,8 +109,8 @@ def hint_of_link(station: Station, bytes_received: int) -> str:
     if not station.gate.is_open:
         return f"{link} is down at present."
     nodes = sorted(station.nodes.values(), key=lambda each: (each.system, each.component))
-    if station.broadcaster is not None:
-        words = kind_in_words(station.broadcaster.autopilot, station.broadcaster.type)
+    if (beat := station.broadcaster) is not None and beat.type not in (MAV_TYPE_GCS, *_PERIPHERALS):
+        words = kind_in_words(beat.autopilot, beat.type)
         return (
             f"A vehicle with system id 0 is heard on {link} ({words or 'of no kind'}): 0 addresses all. "
             "Give it an id from 1 to 255 (MAV_SYS_ID of PX4, SYSID_THISMAV of ArduPilot)."

@@ -29,6 +29,8 @@ SEEK_MAX: Final = 20
 """Requests for the heartbeat of one system: it may be no vehicle, or serve no such request."""
 HEARTBEAT_INTERVAL: Final = 1.0
 """Seconds between two heartbeats of ours, by the standard."""
+PROBES: Final = 5
+"""Ways to find a component that was not heard; the last one is that of components under another address."""
 COMPONENTS_MAX: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each."""
 STREAM_PEERS_MAX: Final = 256
@@ -146,21 +148,19 @@ class Station:
     def probe(self, system: int, component: int) -> None:
         """Request a value of a component that was not heard: it may send no heartbeat.
 
-        By turns a plain and an extended parameter, and the list for firmware without reads; then a parameter
-        of all components of the system, as some answer under another id than they are asked under; and the
-        index 1, where some begin.
+        By turns its first parameter; the list, for firmware without reads; the index 1, where some begin; an
+        extended parameter; and the first of the autopilot, under whose address some answer with their own.
         """
         number = self._asked[system, component] = self._asked.get((system, component), -1) + 1
         target = (system, component)
         ways = (
             PLAIN.request_read(target, 0),
-            EXTENDED.request_read(target, 0),
             PLAIN.request_list(target),
-            PLAIN.request_read((system, messages.COMP_ID_ALL), 0),
             PLAIN.request_read(target, 1),
+            EXTENDED.request_read(target, 0),
+            PLAIN.request_read((system, messages.AUTOPILOT_COMPONENT), 0),
         )
-        version = next((node.version for node in self.nodes.values()), 2)
-        self.transmit(ways[number % len(ways)], None, version)
+        self.transmit(ways[number % PROBES], None, next((node.version for node in self.nodes.values()), 2))
 
     def overhear(self, data: bytes, now: float) -> None:
         """Take a frame that another program sends to the vehicles over this link: it may be a PARAM_SET."""
@@ -306,8 +306,8 @@ class Station:
             listens_only=self.listens_only,
             spawn=self.spawn,
         )
-        if self._asked.get((node.system, node.component), 0) > 2:
-            node.channel.reads_from = (node.system, messages.COMP_ID_ALL)
+        if self._asked.get((node.system, node.component), 0) % PROBES == PROBES - 1:
+            node.channel.reads_from = (node.system, messages.AUTOPILOT_COMPONENT)
         self.nodes[address] = node
         self.discovered(node)
         self.spawn(node.watch_presence)

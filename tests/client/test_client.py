@@ -310,6 +310,13 @@ async def test_fetch_all_waits_for_a_second_vehicle(delay: float) -> None:
         assert (await client.fetch_all()).results.keys() == {(1, 1), (2, 1)}
 
 
+async def test_fetch_all_waits_for_a_px4_that_is_starting() -> None:
+    starting = silent(system=2, autopilot=messages.MAV_AUTOPILOT_PX4)
+    async with a_client(Air([generic(), starting])) as client:
+        asyncio.get_running_loop().call_later(4.0, setattr, starting, "is_deaf", False)
+        assert (await client.fetch_all()).results.keys() == {(1, 1), (2, 1)}
+
+
 async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
     async with a_client(generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
         assert (await client.fetch_all()).results.keys() == {(1, 100)}

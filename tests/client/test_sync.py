@@ -332,7 +332,7 @@ async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, a
         eye = client.components[1, 100]
         assert (await component.get("PARAM_01")).value == 1001
         assert (await eye.get("PARAM_01")).value == 1001
-        await asyncio.sleep(0.5)
+        await asyncio.sleep(1.0)
         assert {*kept(path).values()} == {1}, "it is open whose they are"
         for each in filters if answers else ():
             each.down = lambda message: True

@@ -71,10 +71,7 @@ class Partial(Puppet):
         return messages.ParamValue(name, self.values[name], kind, self._count(index), index)
 
     def _answers(self, message: messages.Message) -> Iterable[messages.Message]:
-        if getattr(message, "target_component", messages.COMP_ID_ALL) not in (
-            messages.COMP_ID_ALL,
-            self._target,
-        ):
+        if getattr(message, "target_component", self._target) != self._target:
             return
         match message:
             case messages.ParamRequestList() if "list" in self._serves:
