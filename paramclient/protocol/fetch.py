@@ -12,7 +12,7 @@ import anyio
 from paramclient.errors import NoReply
 from paramclient.model.names import NamedChoice, first_of
 from paramclient.model.paramset import ParamMap
-from paramclient.model.values import Param, Trust
+from paramclient.model.values import Param
 from paramclient.protocol.checksum import is_moving
 from paramclient.protocol.digest import Answer, ask, settle
 from paramclient.protocol.file_download import download_file
@@ -201,8 +201,8 @@ class _Fetch:
                 await self.session.identification.heard()
             answer = await ask(self.session, refresh=refresh)
         elif self.session.identification.is_ardupilot and not refresh:
-            cached = [each for each in self._before.values() if each.trust is Trust.CACHED]
-            answer = Answer(reason=INCOMPLETE * any(each.index is not None for each in cached))
+            is_cached = any(self._before[name].index is not None for name in self.table.unverified())
+            answer = Answer(reason=INCOMPLETE * is_cached, is_other=self.table.was_complete)
         if answer.is_current:
             self._name_changes()
             if self.policy is Policy.AUTO:

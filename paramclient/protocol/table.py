@@ -96,7 +96,7 @@ class Table:
         self._encoding = Encoding.BYTEWISE
         self._wire: dict[str, tuple[bytes, int]] = {}  # as received, until the encoding is certain
         self.evidence: dict[Encoding, tuple[str, bytes, int]] = {}
-        self._was_complete = False
+        self.was_complete = False
         self._false_count: int | None = None  # a param_count that values exceeded
         self._outdated: set[str] = set()  # names whose index belongs to an earlier count
         self._hash: int | None = None
@@ -291,7 +291,7 @@ class Table:
         """Drop the parameters that a complete list no longer has."""
         if not self.is_complete:
             return
-        self._was_complete = True
+        self.was_complete = True
         names, outdated = self.names, self._outdated
         gone = [
             name
@@ -340,7 +340,7 @@ class Table:
         if old is not None:
             self._report(Change(name, old, new, by, "changed"))
         else:
-            self._report(Change(name, None, new, by, "added" if self._was_complete else "first"))
+            self._report(Change(name, None, new, by, "added" if self.was_complete else "first"))
 
     def _report(self, change: Change) -> None:
         if self._held is None:
@@ -401,7 +401,7 @@ class Table:
         self.count = self._false_count = None
         self.is_growing, self.begins_at_1 = True, False
         self.volatile, self.volatile_is_known = frozenset(), False
-        self._was_complete = False
+        self.was_complete = False
         self.unconfirm()
 
     def forget_doubtful(self) -> None:
@@ -452,7 +452,7 @@ class Table:
             self._hash, self._hash_is_stale = hash, False
             self.volatile = frozenset(volatile)
             self.volatile_is_known = volatile_is_known
-            self._was_complete = self.is_complete
+            self.was_complete = self.is_complete
 
     # PX4's hash
 
