@@ -79,8 +79,7 @@ async def known_of_session(
         return await _stored(session)
     what = f"the parameter metadata of {session.label}"
     with Status(f"waiting for {what}", f"downloading {what}, bytes:") as status:
-        left = session.deadline.left()
-        found = await metadata_of(session.component, timeout=left, progress=status.count)
+        found = await metadata_of(session.component, timeout=session.deadline.left(), progress=status.count)
     if found is None and choice is None:
         found = await _stored(session, added_only=True)
     if found is None:

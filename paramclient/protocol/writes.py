@@ -271,8 +271,7 @@ class _Write:
                             return self._result(wanted)
                         raise self._not_applied(answer)
                 elif adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
-                    wanted = await self._wanted_behind(inbox, self._began)
-                    return self._result(wanted or answer)
+                    return self._result(await self._wanted_behind(inbox, self._began) or answer)
                 else:
                     adjusted = answer
 

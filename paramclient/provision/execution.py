@@ -149,6 +149,8 @@ async def run(
         is_restore: whether they are an earlier state of the vehicle. A parameter that it refuses as read-only
             is then skipped, and not reported as refused.
     """
+    if unknown := sorted(options.keys() - ApplyOptions.__annotations__.keys()):
+        raise TypeError(f"apply and restore have no option {unknown[0]!r}; plan shows what they would write")
     began = anyio.current_time()
     error: ParamClientError | None = None
     one = _Run(component, wanted, options, is_restore=is_restore)

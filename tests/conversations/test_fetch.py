@@ -195,8 +195,7 @@ async def test_silent_mavftp_is_learnt_on_a_lossy_link() -> None:
 
 
 async def test_a_vehicle_that_says_that_it_has_no_mavftp_is_listed_then() -> None:
-    air = Air.symmetric([ArduPilotVehicle(ftp=False)], delay=0.05)
-    async with talking(air) as (conversation, session):
+    async with talking(Air.symmetric([ArduPilotVehicle(ftp=False)], delay=0.05)) as (conversation, session):
         assert (await fetch_all(session)).source == "stream"  # begins before its version is known
         assert len(conversation.sent_of(messages.FileTransfer)) == 1
 

@@ -60,8 +60,7 @@ async def test_silence_to_one_read_of_many_is_no_such_parameter(
 
 
 async def test_silence_is_no_reply_and_not_an_unknown_parameter() -> None:
-    endpoint = Silence(PX4Vehicle(), at=0.5)
-    async with talking(endpoint) as (_, session):
+    async with talking(Silence(PX4Vehicle(), at=0.5)) as (_, session):
         await anyio.sleep(0.6)
         with pytest.raises(NoReply, match="MC_ROLL_P of 1/1") as caught:
             await read(session, "MC_ROLL_P")

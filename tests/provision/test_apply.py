@@ -178,6 +178,8 @@ async def test_the_state_is_stored_before_anything_is_sent(
             broken.setattr(ParamCache, "store_snapshot", fail)
             with pytest.raises(CacheError, match=r"nothing was sent, .*--no-cache"):
                 await apply(component, some("TUNE_01"))
+        with pytest.raises(TypeError, match="no option 'dry_run'"):
+            await apply(component, some("TUNE_01"), dry_run=True)  # type: ignore[call-arg]
         assert sets(tap) == []
         first = await apply(component, some("TUNE_01"))
         await apply(component, some("TUNE_01"))  # nothing to write, no snapshot
