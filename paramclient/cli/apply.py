@@ -191,8 +191,7 @@ async def _from_file(
             params = replace(params, identity=replace(origin or own, uid=own.uid))
         return State(params, is_restore, partial, ExitCode.USAGE if file.left_out else ExitCode.DONE)
 
-    is_extended = options.extended or (source is not None and source.is_extended)
-    return replace(options, extended=is_extended), load
+    return replace(options, extended=options.extended or (source is not None and source.is_extended)), load
 
 
 async def _earlier_state(moment: float | int | None, session: CommandSession) -> State:
@@ -447,5 +446,4 @@ class _Job:
 
 
 def _cells(row: ApplyRow, reason: str) -> Sequence[object]:
-    values = map(row_json(row).get, ("before", "wanted", "actual"))
-    return row.name, *values, row.status, reason
+    return row.name, *map(row_json(row).get, ("before", "wanted", "actual")), row.status, reason

@@ -63,8 +63,7 @@ def milliseconds(seconds: float) -> str:
 
 def local_time(at: float) -> str:
     """Return a unix time as ISO 8601 in the time zone of this computer, with milliseconds and the zone."""
-    found = datetime.fromtimestamp(at).astimezone()
-    return found.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return datetime.fromtimestamp(at).astimezone().isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def listed(words: Sequence[object]) -> str:
@@ -193,18 +192,6 @@ async def confirm(question: str) -> bool:
         await anyio.wait_readable(sys.stdin)  # a terminal becomes readable with a whole line
         answer = sys.stdin.readline()
     return answer.strip().lower() in ("y", "yes")
-
-
-async def require_consent(question: str, otherwise: str) -> None:
-    """Ask a question before something is sent; `otherwise` says how to go on without a terminal.
-
-    Raises:
-        UsageError: the answer is no, or nobody can answer.
-    """
-    if not can_ask():
-        raise errors.UsageError(f"nothing was sent; {otherwise}")
-    if not await confirm(question):
-        raise errors.UsageError("nothing was sent")
 
 
 # The status of a command

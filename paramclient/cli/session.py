@@ -183,7 +183,8 @@ class CommandSession:
             except anyio.get_cancelled_exc_class():
                 received = sum(each.trust is not Trust.CACHED for each in component.params.values())
                 of = "" if component.count is None else f" of {component.count}"
-                kept = "not kept, without a cache" if self.client.cache is None else "kept in the cache"
+                kept = "not kept" if self.client.core.cache_writer.failure else "kept in the cache"
+                kept = "not kept, without a cache" if self.client.cache is None else kept
                 what = f"{received}{of} {noun_of(component)}s of {self.label}"
                 say(f"interrupted: {what} received and {kept}")
                 raise

@@ -17,7 +17,7 @@ from cyclopts.validators import Number
 from paramclient.cli.json_output import JsonObject, info_of, outcome_json, vehicle_json
 from paramclient.cli.metadata import MetadataChoice, known_of_session
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import Status, code_of, report, require_consent, say
+from paramclient.cli.output import ExitCode, Status, can_ask, code_of, confirm, report, say
 from paramclient.cli.session import CommandSession, Sessions, Shown, get_chosen, sessions, spelling
 from paramclient.client.component import SETTLE_MAX
 from paramclient.errors import ParamClientError, UsageError, VehicleError
@@ -66,8 +66,10 @@ async def set_(
                 report(doubt)
             if doubts and not force:
                 receivers = ", ".join(session.receiver for session in jobs)
-                question = f"Write these values to {receivers} all the same?"
-                await require_consent(question, "--force writes what can be written")
+                if not can_ask():
+                    raise UsageError("nothing was sent; --force writes what can be written")
+                if not await confirm(f"Write these values to {receivers} all the same?"):
+                    return ExitCode.INCOMPLETE
             return found.show(await found.work(lambda session: jobs[session].write()))
 
 
@@ -111,6 +113,8 @@ async def _prepare(
         job.described = await known_of_session(session, choice, needed_for=needed_for)
     pairs = {spelling(given, component): text for given, text in texts.items()}
     _, job.errors = await get_chosen(session, [*pairs])
+    if len({spelling(each, component) for each in texts}) < len(texts):
+        raise UsageError(f"{', '.join(texts)}: set takes each parameter once")
     for name, text in pairs.items():
         known = component.params.get(spelling(name, component))
         if component.is_extended:

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from paramclient.cli.json_output import taken
 from paramclient.cli.options import CONNECTION, KeyOptions, Seconds
-from paramclient.cli.output import print_result, require_consent
+from paramclient.cli.output import can_ask, confirm, print_result
 from paramclient.cli.session import ChosenVehicle, Deadline, wait_for_vehicle
 from paramclient.client.client import ParamClient
 from paramclient.client.signing import Signing, read_key
@@ -83,10 +83,10 @@ async def _change(
         VehicleError: the vehicle does not answer afterwards, or has not changed its signing.
     """
     choice = ChosenVehicle.parse(options.vehicle, one="a signing key is set on one vehicle at a time")
-    if not options.link_is_safe:
-        question = f"{consequence} Can no other person or program listen or send on this link?"
+    question = f"{consequence} Can no other person or program listen or send on this link?"
+    if not (options.link_is_safe or (can_ask() and await confirm(question))):
         hint = "add --link-is-safe if no other person or program can listen on this link"
-        await require_consent(question, hint)
+        raise UsageError(f"nothing was sent; {hint}")
     deadline, link = Deadline(options.timeout), create_link(url)
     # a vehicle on USB may answer unsigned
     signing = None if present is None else Signing(present, SigningPolicy.ACCEPT_ALL)

@@ -395,8 +395,7 @@ class Traffic(Tap):
             self._count(address, late=check.late - late, frames=1, bytes=seen.size, signed=seen.is_signed)
             self._counts[address, frame.message_id] += 1
             if frame.message_id in RADIO_STATUS_IDS:
-                payload = frame.payload.ljust(_RADIO_STATUS.size, b"\0")
-                status = _RADIO_STATUS.unpack_from(payload)
+                status = _RADIO_STATUS.unpack_from(frame.payload.ljust(_RADIO_STATUS.size, b"\0"))
                 source.radio = dict(zip(RADIO_STATUS_FIELDS, status, strict=True))
             elif seen.is_known and isinstance(message := decode(frame), Heartbeat):
                 source.heartbeat, source.heartbeat_at = message, now

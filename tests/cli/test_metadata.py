@@ -61,6 +61,7 @@ def test_set_accepts_value_names_of_the_vehicle(command: Command, put: Put) -> N
         (["TST_LOG=7", "FLTMODE1=x", "TST_ALT=1"], "FLTMODE1: 'x' is not a number"),
         (["TST_ALT=high"], "and its values have no names"),
         (["FLTMODE1=5", "FLTMODE1=6"], "FLTMODE1: set takes names, no patterns, and each once"),
+        (["FLTMODE1=5", "fltmode1=6"], "FLTMODE1, fltmode1: set takes each parameter once"),
         (["FLTMODE*=5"], "FLTMODE*: set takes names, no patterns"),
         (["FLTMODE1", "5", "--expected", "4"], "Unknown option: --expected"),
         (["=5"], "a parameter name has at least one character"),

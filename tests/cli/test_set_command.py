@@ -38,7 +38,7 @@ def test_many_pairs_are_in_flight_at_a_time(command: Command, put: Put, kind: An
     assert [row[0] for row in done.rows[1:]] == NAMES
 
 
-def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> None:
+def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put, at_terminal: Any) -> None:
     small = (ParamType.INT8, 0)
     table: dict[str, Any] = {"A": 1.0, "COUNT": 3, "FIXED": 2.0, "SMALL": small}
     vehicle = ArduPilotVehicle(table=table, read_only=["FIXED"], live=(), ftp=False, param_error=True)
@@ -64,3 +64,5 @@ def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put) -> No
     failed = dict.fromkeys(["NO_SUCH", "SMALL", "FIXED"], "refused")
     found = {each["name"]: each["status"] for each in as_json.json["results"]}
     assert found == failed | {"A": "accepted", "COUNT": "adjusted"}
+    at_terminal("n")
+    assert command("set", put(vehicle), *words).code == 1

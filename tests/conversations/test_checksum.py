@@ -131,8 +131,7 @@ async def test_a_value_that_moves_between_two_requests_starts_no_search() -> Non
 
     async with converse(Tap(vehicle, up=passes)) as conversation:
         vehicle.load({"STAT_RUNTIME": 30})
-        node = await with_cached_table(conversation, cached)
-        result = await fetched(vehicle, node)
+        result = await fetched(vehicle, await with_cached_table(conversation, cached))
         assert result.source == "cache"
         assert len(opcodes(conversation)) <= 6
 
@@ -295,8 +294,7 @@ def test_loss_leaves_nothing_wrong(loss: float, changed: dict[str, float]) -> No
             cached = vehicle.params
             vehicle.load(changed)
             async with converse(Air.symmetric([vehicle], loss=loss, delay=0.05, seed=seed)) as conversation:
-                node = await with_cached_table(conversation, cached)
-                await fetched(vehicle, node)
+                await fetched(vehicle, await with_cached_table(conversation, cached))
 
     run(main)
 
@@ -565,6 +563,5 @@ async def test_a_run_time_of_an_old_table_is_no_guess_that_hides_another_change(
     vehicle.load({name: int(from_bits(entries[other].bits ^ change, ParamType.INT32))})
     async with converse(vehicle) as conversation:
         moments = dict.fromkeys(cached, -365 * 86_400.0)
-        node = await with_cached_table(conversation, cached, moments=moments)
-        result = await fetched(vehicle, node)
+        result = await fetched(vehicle, await with_cached_table(conversation, cached, moments=moments))
         assert (result.source, result.changed) == ("cache", (name,))
