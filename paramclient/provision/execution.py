@@ -150,7 +150,7 @@ async def run(
             is then skipped, and not reported as refused.
     """
     if unknown := sorted(options.keys() - ApplyOptions.__annotations__.keys()):
-        raise TypeError(f"apply and restore have no option {unknown[0]!r}; plan shows what they would write")
+        raise TypeError(f"apply and restore have no option {unknown[0]!r}; see ApplyOptions, and plan")
     began = anyio.current_time()
     error: ParamClientError | None = None
     one = _Run(component, wanted, options, is_restore=is_restore)
