@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 import time
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
@@ -263,18 +264,19 @@ def fetched_set(component: Component, result: FetchResult, *, source: str, parti
     indices = sorted({*result.missing, *(index for index in cached if index is not None)})
     missing = [cached.get(index, f"index {index}") for index in indices]
     if missing and not partial:
-        vehicle = (
-            f"{component.system}/{component.component} {component.autopilot} on {component.identity.link}"
-        )
+        who = f"{component.system}/{component.component} {component.autopilot} on {component.identity.link}"
         was = f"{first_of(missing, NAMES_SHOWN_MAX)} {'was' if len(missing) == 1 else 'were'} not received"
-        raise _incomplete(f"{vehicle} is incomplete: {was}", component.system, component.component)
+        raise _incomplete(f"{who} is incomplete: {was}", component.system, component.component)
     known = [name for name in result.params if name not in result.cached]
     return part_set(component, [result.params[name] for name in known], source, missing)
 
 
 def part_set(component: Component, params: Collection[Param], source: str, lacks: Iterable[str]) -> ParamSet:
-    """Return a set that lacks these parameters, and those with a name that the client does not store."""
-    names = [*lacks, *map(repr, sorted(component.session.table.left_out))]
+    """Return a set that lacks these parameters, and those with a name that the client does not store, or that
+    another one has too."""
+    table = component.session.table
+    twice = [f"a second {name}" for name, number in Counter(table.names.values()).items() if number > 1]
+    names = [*lacks, *map(repr, sorted(table.left_out)), *twice]
     kept = sum(param.index is not None for param in params)
     words = f"{kept} of {component.count} parameters, without {first_of(names, NAMES_SHOWN_MAX)}"
     return component_set(component, params, source, words if names else "")

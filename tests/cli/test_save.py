@@ -89,6 +89,13 @@ def test_what_was_received_is_written_with_incomplete_and_the_file_names_the_oth
         path.unlink()
 
 
+def test_a_second_parameter_of_the_same_name_is_told(command: Command, put: Put, tmp_path: Path) -> None:
+    vehicle = Partial()
+    vehicle.sent_as["GAIN_4"] = "GAIN_3"
+    saved = command("save", put(vehicle), tmp_path / "quad.json", "--no-cache")
+    assert (saved.code, "7 of 8 parameters, without a second GAIN_3" in saved.err) == (0, True), saved.err
+
+
 def test_cached_parameters_outside_of_the_list_are_counted_apart(
     command: Command, put: Put, tmp_path: Path
 ) -> None:

@@ -55,6 +55,7 @@ class Partial(Puppet):
         self.types = {name: kind for name, (_, kind) in table.items()}
         self._serves = frozenset(serves)
         self._indices = {name: first + step * place for place, name in enumerate(table)}
+        self.sent_as: dict[str, str] = {}  # other names of parameters
         self._count = count or (lambda index: len(table))
         self._ack_type = ack_type
         self._on_set = on_set
@@ -68,7 +69,8 @@ class Partial(Puppet):
     def _value(self, name: str, kind: ParamType | None = None) -> messages.ParamValue:
         index = self._indices[name]
         kind = self.types[name] if kind is None else kind
-        return messages.ParamValue(name, self.values[name], kind, self._count(index), index)
+        sent_as = self.sent_as.get(name, name)
+        return messages.ParamValue(sent_as, self.values[name], kind, self._count(index), index)
 
     def _answers(self, message: messages.Message) -> Iterable[messages.Message]:
         if getattr(message, "target_component", self._target) != self._target:

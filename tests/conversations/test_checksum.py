@@ -417,8 +417,7 @@ def test_no_difference_is_ever_taken_for_equal(changes: dict[str, int], kind: st
         elif kind == "count":
             del cached[NAMES[-1]]
         async with cached_on(vehicle, {each.name: each for each in cached.values()}) as (_, node):
-            result = await fetched(vehicle, node)
-            assert set(result.params) == set(vehicle.params)
+            assert set((await fetched(vehicle, node)).params) == set(vehicle.params)
 
     run(main)
 
@@ -458,8 +457,7 @@ async def test_a_value_makes_up_for_no_other_name_or_type(
     cached = vehicle.params
     change(cached, *names)
     async with cached_on(vehicle, cached) as (_, node):
-        result = await fetched(vehicle, node)
-        assert set(result.params) == set(vehicle.params)
+        assert set((await fetched(vehicle, node)).params) == set(vehicle.params)
 
 
 async def test_a_change_in_the_middle_of_a_proof_is_not_proven() -> None:
@@ -498,8 +496,7 @@ async def test_a_list_with_a_gap_in_its_names_is_no_question_for_a_checksum() ->
     cached["WP_NAVALT_MIN_"] = replace(cached["WP_NAVALT_MIN"], name="WP_NAVALT_MIN_")
     async with cached_on(vehicle, cached, count=1382) as (_, node):
         node.plain.table.names[9] = node.plain.table.names[8]
-        result = await fetched(vehicle, node)
-        assert result.source == "ftp"
+        assert (await fetched(vehicle, node)).source == "ftp"
 
 
 @pytest.mark.parametrize("is_cached", [True, False], ids=["cached", "downloaded"])

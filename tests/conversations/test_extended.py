@@ -62,8 +62,7 @@ async def test_values_of_every_type_are_fetched_read_and_set(loss: float) -> Non
         for name in new:
             await read(session, name)
             assert session.table.params[name] == camera.ext_params[name]
-        by_index = await read(session, 3)
-        assert by_index.param_id == "CAM_ISO"
+        assert (await read(session, 3)).param_id == "CAM_ISO"
 
 
 async def test_a_set_sends_nothing_that_does_not_fit_and_reports_every_refusal() -> None:

@@ -194,8 +194,7 @@ async def test_a_vehicle_that_restarts_in_the_middle_of_its_list_is_fetched_whol
     for vehicle in (PX4Vehicle(), ArduPilotVehicle(ftp=False)):
         async with talking(vehicle) as (_, session):
             vehicle.when_listed(300, lambda vehicle=vehicle: vehicle.reboot(down=1.5))  # type: ignore[misc]  # a default
-            result = await fetch_all(session)
-            assert not result.missing
+            assert not (await fetch_all(session)).missing
             await anyio.sleep(3.0)
             await fetch_all(session)
             check_right(vehicle, dict(session.table.params))

@@ -77,8 +77,7 @@ async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(parts: 
 
 async def test_an_acknowledgement_in_another_type_changes_neither_the_type_nor_the_history() -> None:
     for kind in (ParamType.REAL32, ParamType.UINT32, ParamType.INT8):
-        vehicle = Partial(ack_type=kind)
-        async with talking(vehicle) as (conversation, session):
+        async with talking(Partial(ack_type=kind)) as (conversation, session):
             await fetch_all(session)
             conversation.changes.clear()
             result = await write(session, "MODE", 4)
@@ -317,8 +316,7 @@ async def test_a_component_without_heartbeat_is_found_by_both_ids(
             await client.component(1, 241)
         with pytest.raises(errors.NoReply):
             await client.component(component=242)
-        writable = await client.only_component(1, 240)
-        assert writable is component
+        assert await client.only_component(1, 240) is component
 
 
 async def test_values_under_another_id_are_named_and_can_be_read() -> None:
