@@ -202,7 +202,7 @@ class _Fetch:
             answer = await ask(self.session, refresh=refresh)
         elif self.session.identification.is_ardupilot and not refresh:
             is_cached = any(self._before[name].index is not None for name in self.table.unverified())
-            answer = Answer(reason=INCOMPLETE * is_cached, is_other=self.table.was_complete)
+            answer = Answer(reason=INCOMPLETE * is_cached, is_other=is_cached and self.table.was_complete)
         if answer.is_current:
             self._name_changes()
             if self.policy is Policy.AUTO:

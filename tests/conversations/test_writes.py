@@ -458,7 +458,7 @@ async def test_a_switch_and_the_parameters_behind_it_are_set_in_one_call() -> No
         outcomes = await many(session, [("RTL_ALT", 1600), ("EK2_ENABLE", 1), (hidden, 1), ("RTL_SPEED", 5)])
         assert all(each.status is SetStatus.ACCEPTED for each in outcomes)
         assert vehicle.param(hidden).value == 1
-        await fetch_all(session)
+        assert not (await fetch_all(session)).changed, "nothing of it was cached"
         assert session.table.count == (count or 0) + 52
         assert session.table.params[hidden].trust is Trust.LIVE
         await many(session, [("EK2_ENABLE", 0)])
