@@ -361,15 +361,15 @@ def open_client(url: str, options: TrafficOptions, **more: Any) -> ParamClient:
 async def _with_parameters(components: Sequence[Component]) -> list[Component]:
     """Return the components that have a parameter, and print a line for each other."""
 
-    async def ask(request: Awaitable[object]) -> None:
+    async def ask(request: Callable[..., Awaitable[object]], *which: int) -> None:
         with suppress(NoReply, UnknownParameter):
-            await request
+            await request(*which, timeout=OTHERS_TIMEOUT)
 
     async with anyio.create_task_group() as tasks:
         for each in components:
             for first in (0, 1):  # some begin at 1
-                tasks.start_soon(ask, each.get(first, timeout=OTHERS_TIMEOUT))
-            tasks.start_soon(ask, each.fetch_all(timeout=OTHERS_TIMEOUT))  # some serve lists only
+                tasks.start_soon(ask, each.get, first)
+            tasks.start_soon(ask, each.fetch_all)  # some serve lists only
     for each in components:
         if each.count is None:
             hint = "" if each.is_extended else "; --extended uses extended ones"
