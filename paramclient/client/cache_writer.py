@@ -103,9 +103,8 @@ class CacheWriter:
     async def open(self) -> None:
         """Load the list of cached components."""
         if self.cache is not None:
-            with suppress(CacheError):
-                found = await self.call(self.cache.components, is_told=False)
-                self._known = {(which, each.component) for each in found for which in (each.system, each.key)}
+            found = await self.attempt(self.cache.components) or []
+            self._known = {(which, each.component) for each in found for which in (each.system, each.key)}
 
     async def close(self, nodes: Collection[Node]) -> None:
         """Write all new values, warn of lost ones, and close the cache if it is owned.
@@ -167,11 +166,8 @@ class CacheWriter:
             return
         for session in node.sessions:
             is_extended = session is node.extended
-            cached = None
-            with suppress(CacheError):
-                load = partial(self.cache.load, identity.key, node.component, extended=is_extended)
-                cached = await self.call(load, is_told=False)
-            self._tell()
+            load = partial(self.cache.load, identity.key, node.component, extended=is_extended)
+            cached = await self.attempt(load)
             if vehicle.identification.identity.key != identity.key:
                 return  # another vehicle has taken the address meanwhile, and its table is loaded
             if identity.uid is not None:
@@ -355,6 +351,13 @@ class CacheWriter:
             self.failure = error
             self._is_told |= is_told
             raise CacheError(str(error)) from error
+
+    async def attempt(self, work: Callable[[], T]) -> T | None:
+        """Run a cache call in the thread; return None where it fails, as the log says."""
+        with suppress(CacheError):
+            return await self.call(work, is_told=False)
+        self._tell()
+        return None
 
     def _tell(self) -> None:
         """Log a failure once, unless a call has raised it, or `close` logs what is lost."""

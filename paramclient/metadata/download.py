@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
@@ -43,7 +43,8 @@ async def metadata_of(
     """Return the parameter metadata of a component, or None if the component has none.
 
     Always requests COMPONENT_METADATA; a cached file is used if it has the announced checksum. Downloads
-    nothing from the internet. Cancellation closes open files on board.
+    nothing from the internet. Cancellation closes open files on board. A metadata cache that cannot be
+    written costs one warning, together with the client's cache.
 
     Args:
         component: from `ParamClient.component`.
@@ -77,7 +78,8 @@ async def metadata_of(
         read = await run_sync(partial(read_content, content, source=f"{uri} of {files.label}"))
         now = component.identity
         if kept is not None and crc is not None and before.uid in (None, now.uid):
-            await run_sync(kept.remember, now, component.component, crc)
+            keep = partial(kept.keep, files.received, now, component.component, crc)
+            await component.core.cache_writer.attempt(keep)
         return read
 
 
@@ -89,11 +91,13 @@ class _Files:
         component: the component.
         kept: the metadata cache, or None.
         progress: called for each file.
+        received: by checksum, the files from on board.
     """
 
     component: Component
     kept: MetadataStore | None
     progress: Callable[[int, int | None], None] | None
+    received: dict[int, bytes] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -119,8 +123,7 @@ class _Files:
             if not await run_sync(has_checksum, content, crc):
                 problem = f"the file of {self.label} does not have the announced checksum {crc:08x}"
                 raise FileError(problem, source=uri)
-            if self.kept is not None:
-                await run_sync(self.kept.put, content, crc)
+            self.received[crc] = content
         return content
 
     def _on_board(self, uri: str) -> tuple[Component, str]:

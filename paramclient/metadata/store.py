@@ -7,7 +7,7 @@ import logging
 import lzma
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -169,7 +169,7 @@ class MetadataStore:
 
     A folder of small files, each replaced atomically and readable only by its owner. A file that no longer
     has its checksum is deleted and treated as missing. Several processes may use the folder at the same time.
-    Disk errors are logged as warnings, and nothing is cached. Every call blocks for a few milliseconds, and
+    A file that cannot be read is logged as a warning. Every call blocks for a few milliseconds, and
     `known` for up to half a second if it parses a large file. The last two parsed files are kept.
 
     Args:
@@ -200,15 +200,16 @@ class MetadataStore:
             return None
         return content
 
-    def put(self, content: bytes, crc: int) -> None:
-        """Cache a file with this checksum."""
-        self._write(self._file(crc), content)
+    def keep(self, files: Mapping[int, bytes], identity: Identity, component: int, crc: int) -> None:
+        """Cache files by checksum, and record which of them describes a firmware's parameters.
 
-    def remember(self, identity: Identity, component: int, crc: int) -> None:
-        """Record that the file with this checksum describes a firmware's parameters."""
-        path = self._note(identity, component)
-        if path is not None:
-            self._write(path, f"{crc:08x}\n".encode("ascii"))
+        Raises:
+            FileError: one cannot be written.
+        """
+        for checksum, content in files.items():
+            _replace(self._file(checksum), content)
+        if (note := self._note(identity, component)) is not None:
+            _replace(note, f"{crc:08x}\n".encode("ascii"))
 
     def known(self, identity: Identity, component: int) -> Metadata | None:
         """Return the metadata of a firmware, or None.
@@ -262,12 +263,6 @@ class MetadataStore:
         except FileError as error:
             logger.warning("%s", error)
             return None
-
-    def _write(self, path: Path, content: bytes) -> None:
-        try:
-            _replace(path, content)
-        except FileError as error:
-            logger.warning("%s", error)
 
 
 def has_checksum(content: bytes, crc: int) -> bool:

@@ -93,6 +93,5 @@ def test_a_store_prefers_what_the_vehicle_has_provided(tmp_path: Path) -> None:
     assert store.known(identity, 1) is found, "an unchanged file is parsed once"
     store.added.add(described(tmp_path, "ArduCopter", 9))
     assert shown(store.known(identity, 1)) == 9
-    store.put(own, crc32_px4(own))
-    store.remember(identity, 1, crc32_px4(own))
+    store.keep({crc32_px4(own): own}, identity, 1, crc32_px4(own))
     assert shown(store.known(identity, 1)) == 8

@@ -22,6 +22,7 @@ from paramclient.model.px4_hash import crc32_px4
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.sim.px4 import GENERAL_FILE, METADATA_FILE
 from paramclient.wire.messages import FileTransfer
+from tests.caches import read_only
 from tests.shell import Tap, a_client, generic, outcome, residue, small_px4
 
 IDENTITY = Identity(1, "link", "abcd", 12, 2, 0x01110000, "0123abcd", 1)
@@ -191,8 +192,7 @@ def test_a_firmware_is_identified_by_version_commit_and_board(tmp_path: Path) ->
     kept = MetadataStore(tmp_path / "a" / "b")
     assert kept.known(IDENTITY, 1) is None
     content = described()
-    kept.put(content, crc32_px4(content))
-    kept.remember(IDENTITY, 1, crc32_px4(content))
+    kept.keep({crc32_px4(content): content}, IDENTITY, 1, crc32_px4(content))
     for same in (IDENTITY, replace(IDENTITY, system=7, uid="ffff", link="other")):
         known = kept.known(same, 1)
         assert known is not None
@@ -207,8 +207,7 @@ def test_a_damaged_file_is_deleted(damage: bytes, tmp_path: Path, caplog: pytest
     kept = MetadataStore(tmp_path)
     content = described()
     crc = crc32_px4(content)
-    kept.put(content, crc)
-    kept.remember(IDENTITY, 1, crc)
+    kept.keep({crc: content}, IDENTITY, 1, crc)
     (path,) = tmp_path.glob("*.metadata")
     path.write_bytes(damage)
     with caplog.at_level(logging.WARNING, "paramclient"):
@@ -217,13 +216,16 @@ def test_a_damaged_file_is_deleted(damage: bytes, tmp_path: Path, caplog: pytest
     assert not list(tmp_path.iterdir())
 
 
-def test_disk_errors_are_logged_as_warnings(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    (tmp_path / "file").write_text("in the way")
-    kept = MetadataStore(tmp_path / "file")
-    content = described()
-    with caplog.at_level(logging.WARNING, "paramclient"):
-        kept.put(content, crc32_px4(content))
-        kept.remember(IDENTITY, 1, crc32_px4(content))
-        assert kept.get(crc32_px4(content)) is None
-        assert kept.known(IDENTITY, 1) is None
-    assert "cannot be written" in caplog.text
+async def test_a_folder_that_cannot_be_written_is_one_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """For the cache too, whose cause is the same."""
+    path = tmp_path / "cache"
+    with read_only(tmp_path):
+        async with a_client(describing(), cache=str(path)) as client:
+            component = await client.component()
+            assert await metadata_of(component) is not None
+            await component.fetch_all()
+            assert MetadataStore.beside(path).known(component.identity, 1) is None
+    [warning] = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    assert "cannot be written" in warning
