@@ -33,7 +33,7 @@ from paramclient.errors import LinkError, UsageError
 from paramclient.protocol.channel import task_group
 from paramclient.service import routes
 from paramclient.service.hub import Hub
-from paramclient.service.problems import ERRORS, RESPONSES, ServiceError, problem_response, respond
+from paramclient.service.problems import ERRORS, RESPONSES, Problem, ServiceError, problem_response, respond
 from paramclient.version import __version__
 
 BODY_BYTES_MAX: Final = 4 * 2**20
@@ -236,12 +236,16 @@ def cancel_on_disconnect(app: ASGIApp) -> ASGIApp:
 
 
 class _Application(FastAPI):
-    """FastAPI whose description is valid OpenAPI 3.1: the schema of an event is of 3.2."""
+    """FastAPI whose description is valid OpenAPI 3.1: the schema of an event is of 3.2.
+
+    With a model, FastAPI would describe errors as application/json too.
+    """
 
     def openapi(self) -> dict[str, Any]:
         described = super().openapi()
         content = described["paths"]["/api/events"]["get"]["responses"]["200"]["content"]
         content["text/event-stream"] = {"schema": {"type": "string"}}
+        described["components"]["schemas"]["Problem"] = Problem.model_json_schema()
         return described
 
 

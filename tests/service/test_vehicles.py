@@ -174,6 +174,9 @@ async def test_metrics_and_openapi_are_complete() -> None:
         described = (await browser.get("/openapi.json")).json()
         assert {"get", "put"} <= described["paths"]["/api/vehicles/{system}/{component}/params/{name}"].keys()
         assert "Problem" in described["components"]["schemas"]
+        operations = [each for path in described["paths"].values() for each in path.values()]
+        errors = {kind for each in operations for kind in each["responses"]["default"]["content"]}
+        assert errors == {"application/problem+json"}
         assert "itemSchema" not in str(described)  # it is of OpenAPI 3.2
 
 
