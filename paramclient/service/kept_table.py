@@ -419,7 +419,7 @@ class KeptTable(Stream[Change]):
                 with anyio.move_on_after(SET_TIMEOUT) as scope:
                     async with first.station.writing:
                         code = await self._write(key, f"station {first.system}/{first.component}", scope)
-                is_open = scope.cancelled_caught and self.beats < beats_min and not self.is_lost
+                is_open = scope.cancelled_caught and self.beats < beats_min
         except ParamClientError as error:
             code = _code_of(error)
         finally:

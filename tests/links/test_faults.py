@@ -19,8 +19,6 @@ from tests.cable import TIMEOUT
 from tests.links.test_links import HEARTBEAT, udp_socket
 from tests.shell import a_client, bits, generic
 
-GONE = [errno.ENETDOWN, errno.ENETUNREACH, errno.EADDRNOTAVAIL, errno.EINVAL]
-
 
 @pytest.fixture
 def errors(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[int]]:
@@ -49,13 +47,12 @@ async def failure(link: Link) -> LinkError:
     return caught.value
 
 
-@pytest.mark.parametrize("reason", GONE)
 @pytest.mark.asyncio
-async def test_an_outage_loses_only_sent_datagrams(errors: dict[str, list[int]], reason: int) -> None:
+async def test_an_outage_loses_only_sent_datagrams(errors: dict[str, list[int]]) -> None:
     with udp_socket() as vehicle:
         link: Any = create_link(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}")
         await link.open()
-        errors["sendto"].append(reason)
+        errors["sendto"].append(errno.ENETDOWN)
         await link.send(b"lost", None)
         await link.send(b"1", None)
         assert vehicle.recv(10) == b"1"

@@ -71,11 +71,6 @@ def udp_socket(to: tuple[str, int] | None = None, *, host: str = "127.0.0.1") ->
         yield sock
 
 
-def free_udp_port() -> int:
-    with udp_socket() as sock:
-        return int(sock.getsockname()[1])
-
-
 @contextmanager
 def tcp_listener(backlog: int = 8) -> Iterator[socket.socket]:
     with socket.create_server(("127.0.0.1", 0), backlog=backlog) as listener:
@@ -324,11 +319,12 @@ async def test_udpout_receives_only_from_its_target_and_keeps_its_port() -> None
 
 
 async def test_udpout_may_start_before_its_vehicle() -> None:
-    port = free_udp_port()
-    async with opened(f"udpout:127.0.0.1:{port}") as link:
+    with udp_socket() as free:
+        address = free.getsockname()
+    async with opened(f"udpout:127.0.0.1:{address[1]}") as link:
         await link.send(frame(1), None)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
-            vehicle.bind(("127.0.0.1", port))
+            vehicle.bind(address)
             vehicle.settimeout(TIMEOUT)
             await link.send(frame(2), None)  # must not be lost with the error of the first
             assert vehicle.recv(1000) == frame(2)
@@ -366,7 +362,6 @@ async def test_a_burst_waits_for_a_late_reader(kind: str) -> None:
     ("name", "text"),
     [
         ("udpin:192.0.2.1:0", r"192\.0\.2\.1 is not an address of this computer"),
-        ("tcpin:192.0.2.1:0", r"192\.0\.2\.1 is not an address of this computer"),
         ("udpout:[fe80::1]:14550", "cannot open: "),
         ("tcp:255.255.255.255:5760", "no route to 255.255.255.255:5760: .* in the network of the vehicle"),
     ],

@@ -490,8 +490,9 @@ async def test_rule_3_the_hash_is_answered_in_under_a_second_before_the_table_is
         assert not (await served.clients[0].component()).session.table.is_complete
 
 
+@pytest.mark.parametrize("beat_at", [2, 10])
 @pytest.mark.parametrize(("autopilot", "raw"), [(3, struct.pack("<f", 120)), (12, struct.pack("<i", 120))])
-async def test_rule_3_no_value_is_served_while_its_encoding_is_in_doubt(autopilot: int, raw: bytes) -> None:
+async def test_rule_3_no_value_is_served_or_set_in_doubt(autopilot: int, raw: bytes, beat_at: int) -> None:
     """The first heartbeat may wait behind a list; 120.0 of an ArduPilot is another number byte by byte."""
     values = [ParamValue(f"INT_{index}", raw, ParamType.INT32, 2, index) for index in range(2)]
     vehicle = Puppet(lambda message: values * isinstance(message, ParamRequestList), heartbeat=None)
@@ -500,7 +501,7 @@ async def test_rule_3_no_value_is_served_while_its_encoding_is_in_doubt(autopilo
         station.send(GCS)
         vehicle.say(values[0])
         write = ParamSet(1, 1, "INT_0", raw, ParamType.INT32)
-        for _ in range(10):
+        for _ in range(beat_at):
             await station.ask(LIST, ParamRequestRead(1, 1, "", 0), write, seconds=1.0)
             assert {each.raw for each in station.of(ParamValue)} <= {raw}
         for _ in range(6):
@@ -564,15 +565,16 @@ async def test_rule_3_a_component_without_heartbeats_is_lost_after_a_minute() ->
             assert len(station.of(messages.ParamExtAck)) == answers, seconds
 
 
-async def test_rule_3_a_vehicle_that_is_lost_during_the_fetch_is_served_when_it_is_back() -> None:
+@pytest.mark.parametrize("seconds", [0.0, 0.5])
+async def test_rule_3_a_vehicle_lost_during_the_fetch_is_served_when_it_is_back(seconds: float) -> None:
     vehicle = Tap(Air.symmetric([PX4Vehicle()], rate=20_000.0))
     async with gateway_over(vehicle) as served:
         station = served.partner()
         station.send(GCS)
         await until(lambda: station.frames)
-        await station.ask(LIST, seconds=0.5)
+        await station.ask(LIST, seconds=seconds)
         vehicle.is_mute = True
-        await anyio.sleep(30.0)
+        await anyio.sleep(10.0)
         vehicle.is_mute = False
         await anyio.sleep(3.0)
         vehicle.received.clear()
@@ -695,6 +697,17 @@ async def test_rule_4_an_error_within_3_seconds_during_the_fetch_by_a_vehicle_th
         vehicle.is_deaf = True
         await station.ask(set_to("ATC_ANG_RLL_P", 3, ParamType.REAL32), seconds=3.0)
         assert station.of(messages.ParamError) == [messages.ParamError(255, 190, "ATC_ANG_RLL_P", -1, 4)]
+
+
+async def test_rule_4_an_error_within_3_seconds_where_the_type_has_to_be_read() -> None:
+    vehicle = Tap(Air.symmetric([small_px4()], delay=0.5))
+    async with gateway_over(vehicle) as served:
+        await served.clients[0].component()
+        station = served.partner()
+        await station.ask(set_to("PARAM_01", 33), seconds=0.8)
+        vehicle.is_deaf = True  # before the set
+        await anyio.sleep(2.2)
+        assert [each.error for each in station.of(messages.ParamError)] == [4]
 
 
 async def test_rule_4_an_error_within_3_seconds_during_the_fetch_by_a_camera_too() -> None:
