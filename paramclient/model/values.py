@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from enum import IntEnum, StrEnum
 from functools import lru_cache
 from typing import Final, SupportsFloat, SupportsIndex, TypeAlias
@@ -183,7 +183,8 @@ class Param:
 
     def with_trust(self, trust: Trust) -> Param:
         """Return this parameter with another trust."""
-        return self if self.trust is trust else replace(self, trust=trust)
+        value = self.name, self.value, self.type, self.index, self.bits
+        return Param(*value, trust, self.default, self.is_raw)
 
     def same_value(self, other: Param) -> bool:
         """Return whether both have the same value in the same type (−0 equals 0, NaN is compared by bits)."""
