@@ -18,7 +18,7 @@ from collections.abc import Collection, Iterator
 from itertools import pairwise
 from typing import Final
 
-import anyio
+import anyio.lowlevel
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, VehicleError
 from paramclient.model.px4_hash import crc32_px4, crc32_px4_before
@@ -37,7 +37,7 @@ AT_ONCE: Final = 5
 INTERVAL_FIRST: Final = 0.020
 """Seconds from these to the next request: a Plane and a Rover look for requests every 20 ms."""
 SCATTERED: Final = 0.1
-"""Seconds between answers in which a value that always moves may have done so."""
+"""Seconds beyond a round trip in which a value that always moves may have done so."""
 INTERVAL: Final = 0.006
 """Seconds between further requests: ArduPilot loses some of those sent every 4 ms (measured)."""
 REQUEST_SIZE: Final = 65
@@ -119,8 +119,9 @@ async def prove(session: Session) -> None:
             raise FileUnavailable(f"the checksum was refused: {error.reason}") from None
         except NoReply as error:
             session.ftp_unanswered += error.attempts
-            is_silent = session.serves_checksum is None
-            raise FileUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
+            raise FileUnavailable(
+                "MAVFTP did not answer", is_silent=session.serves_checksum is None
+            ) from None
     raise TableDiffers(OTHER)
 
 
@@ -305,13 +306,11 @@ class _Proof:
         session, whole = self._session, range(len(self._rows))
         attempts = session.ftp_attempts()
         ranges = sorted(places, key=len, reverse=True)
-        answered: list[float] = []
 
         async def request(place: range) -> None:
             query = "" if place == whole else f"?start={place.start}&count={len(place)}"
             self._found[place] = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
             session.serves_checksum = True
-            answered.append(anyio.current_time())
 
         async with task_group() as tasks:
             for number, place in enumerate(ranges):
@@ -319,8 +318,10 @@ class _Proof:
                     await anyio.sleep(INTERVAL if number > AT_ONCE else INTERVAL_FIRST)
                 tasks.start_soon(request, place)
             sent_at = anyio.current_time()
-        self._is_scattered = max(answered) - min(answered) > SCATTERED
+            await anyio.lowlevel.checkpoint()  # the requests are sent first
+            self._entries(ranges[0])  # while the vehicle computes
         elapsed = anyio.current_time() - sent_at
+        self._is_scattered = elapsed > (session.channel.timing.round_trip or elapsed) + SCATTERED
         self._round_trip = min(self._round_trip, elapsed)
         self._byte_time = (elapsed - self._round_trip) / (REQUEST_SIZE * len(ranges))
 
@@ -371,7 +372,10 @@ class _Proof:
             default = table.params[row.name].default
             bits = None if default is None else bits_of(default, row.type)
             table.store_entry(row._replace(default=bits), at, moment, with_defaults=False)
-        if _rows(table) != self._rows:
+        current = _rows(table)
+        for at in self._always:
+            self._take(at, current[at].bits, 0.0)  # what the vehicle has announced meanwhile
+        if current != self._rows:
             return False
         names = {self._rows[at].name for at in self._changed}
         if names and len(names) <= OFTEN_MAX:

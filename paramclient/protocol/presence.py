@@ -78,16 +78,15 @@ class Presence:
         interval = now - self.beat_at
         if interval > DUPLICATE_TIME:
             self._interval = min(self._interval, interval)
-        has_beaten, was_booting = self.has_beaten, self.is_booting
+        was_running = self.has_beaten and not self.is_booting
         self.beat_at = now
         self._is_high_latency = False
         self.base_mode = message.base_mode
         self.is_booting = message.system_status == MAV_STATE_BOOT
-        is_new = has_beaten and self.is_booting and not was_booting
-        if is_new and now - self._rebooted_at > PATH_LATENCY_MAX:
+        is_new = was_running and self.is_booting and now - self._rebooted_at > PATH_LATENCY_MAX
+        if is_new:
             self.rebooted(now)
-            return True
-        return False
+        return is_new
 
     def high_latency(self) -> None:
         """Take a HIGH_LATENCY2: further ones arrive every few seconds."""
@@ -111,14 +110,12 @@ class Presence:
         is_late = boot_ms > possible or before + passed - boot_ms <= 1000 * REORDERING_TIME
         if is_back and is_late:
             return False
+        is_known = now - self._rebooted_at < PATH_LATENCY_MAX
         if is_back:
-            is_known = now - self._rebooted_at < PATH_LATENCY_MAX
             self.rebooted(now)
-            self._clocks[message_id] = (boot_ms, now)
-            return not is_known
         if message_id in self._clocks or len(self._clocks) < CLOCKS_MAX:
             self._clocks[message_id] = (boot_ms, now)
-        return False
+        return is_back and not is_known
 
     def rebooted(self, now: float) -> None:
         """Forget the clocks: the component has rebooted."""

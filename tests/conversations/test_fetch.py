@@ -64,8 +64,7 @@ async def test_every_value_arrives_on_a_lossy_link(kind: str, loss: float) -> No
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
 async def test_every_value_arrives_over_a_satellite(kind: str, loss: float) -> None:
     for seed in range(4 if loss else 1):
-        vehicle = new_vehicle(kind)
-        air = Air.symmetric([vehicle], delay=1.2, jitter=0.05, loss=loss, seed=seed)
+        air = Air.symmetric([new_vehicle(kind)], delay=1.2, jitter=0.05, loss=loss, seed=seed)
         async with talking(air) as (_, session):
             result = await fetch_all(session)
             assert not result.missing

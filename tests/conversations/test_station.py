@@ -351,8 +351,7 @@ async def test_a_whole_session_in_mavlink_1(make: type[Vehicle]) -> None:
     async with talking(vehicle) as (conversation, session):
         await session.identification.settled()
         conversation.sent.clear()
-        result = await fetch_all(session)
-        assert bits(result.params) == bits(vehicle.params)
+        assert bits((await fetch_all(session)).params) == bits(vehicle.params)
         assert {
             data[0] for data in conversation.sent if not isinstance(messages_in(data)[0], messages.Heartbeat)
         } == {0xFE}
