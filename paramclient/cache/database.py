@@ -434,9 +434,6 @@ def _create(connection: sqlite3.Connection) -> None:
 
 def _read_nothing(work: Callable[[Transaction], T]) -> T:
     """Run a function that reads on an empty cache."""
-    connection = _connect("file::memory:")
-    try:
+    with closing(_connect("file::memory:")) as connection:
         _create(connection)
         return work(Transaction(connection))
-    finally:
-        connection.close()

@@ -61,7 +61,7 @@ class ParamCache:
         place: the file, or the URL of the database without password, for messages.
 
     Raises:
-        UsageError: the URL is not valid, psycopg is not installed, or the file is none of SQLite.
+        UsageError: the URL is not valid, psycopg is not installed, or the path is that of no file of SQLite.
         CacheError: from every method that reads or writes: the cache cannot be used (it is read-only, the
             disk is full, another process writes for more than 5 s, the database cannot be reached), or it is
             closed. Nothing was written.
@@ -80,6 +80,9 @@ class ParamCache:
             self._store = PostgresStore(str(path))
         else:
             self.path = Path(default_path() if path is None else path).resolve()
+            with suppress(OSError):
+                if self.path.exists() and not self.path.is_file():  # opening a pipe would wait for its writer
+                    raise UsageError(f"{self.path} is not a regular file, and no cache")
             with suppress(OSError), self.path.open("rb") as file:
                 if path is not None and file.read(16).strip(b"\0") not in (b"", b"SQLite format 3"):
                     raise UsageError(f"{self.path} is another file, and no cache; it is not touched")

@@ -93,10 +93,13 @@ def test_a_place_that_cannot_be(tmp_path: Path) -> None:
         for use in (cache.vehicles, lambda: cache.save(whole_table(1))):
             with pytest.raises(CacheError, match="cannot be used"):
                 use()
-    for name, problem in (("postgresql://a b", "not valid"), (str(tmp_path / "file"), "another file")):
+    os.mkfifo(tmp_path / "pipe")
+    problems = {"postgresql://a b": "not valid", str(tmp_path / "file"): "another file"}
+    problems |= dict.fromkeys([str(tmp_path / "pipe"), str(tmp_path), os.devnull], "not a regular file")
+    for name, problem in problems.items():
         with pytest.raises(UsageError, match=problem):
             ParamCache(name)
-    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+    assert {each.name for each in tmp_path.iterdir()} == {"file", "pipe"}
 
 
 def test_a_reader_that_may_not_write_sees_what_is_written_later_or_says_that_it_may_not(

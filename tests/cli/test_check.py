@@ -6,7 +6,6 @@ from typing import Any
 
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from tests.commands import Command, Put
-from tests.shell import Tap
 
 
 def texts(document: dict[str, Any]) -> str:
@@ -19,6 +18,7 @@ def test_a_vehicle_on_a_good_link_has_no_findings(command: Command, put: Put) ->
         assert (done.code, done.json["findings"]) == (0, [])
         assert done.json["list"]["received"] == done.json["list"]["count"]
         assert 0 <= done.json["link"]["round_trip"]["median_s"] < 0.1
+        assert not vehicle.requests["PARAM_SET"]
     assert (done.json["files"]["parameters"], done.json["files"]["defaults"]) == (1382, True)
 
 
@@ -32,13 +32,6 @@ def test_the_cost_of_proving_a_cached_table_is_measured(command: Command, put: P
         assert 50 < found["bytes"] < limit
     rows = dict(row for row in command("check", put(ArduPilotVehicle(ftp=False))).rows if len(row) == 2)
     assert rows["checksum"].startswith("none: ")
-
-
-def test_nothing_is_changed(command: Command, put: Put) -> None:
-    vehicle = Tap(PX4Vehicle())
-    assert command("check", put(vehicle)).code == 0
-    names = {type(message).__name__ for _, _, message in vehicle.received}
-    assert not names & {"ParamSet", "ParamSetMessage"}
 
 
 def test_the_output_is_a_table(command: Command, put: Put) -> None:
