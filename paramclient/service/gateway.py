@@ -35,7 +35,8 @@ GROUND_STATION_SYSTEM: Final = 255
 OWN_TYPE: Final = 18
 """MAV_TYPE_ONBOARD_CONTROLLER, for the same reason."""
 GROUND_STATION_PARAMS: Final = frozenset({"SYSID_MYGCS", "MAV_GCS_SYSID"})
-"""ArduPilot's parameter with the system id of its ground station, whose heartbeats it watches."""
+"""ArduPilot's parameter with the system id of its ground station, whose heartbeats it watches; one with `_HI`
+behind this name has the last of several."""
 LOOP_TIME: Final = 2.0
 """Seconds after which a frame that was sent is not taken for its own copy any more."""
 
@@ -269,16 +270,18 @@ class VehicleLink(Tap):
                 if seen.frame.message_id == HEARTBEAT and node is not None:
                     for table in (self._table(node, extended=each) for each in (False, True)):
                         table.heartbeat, table.beats = decode(seen.frame), table.beats + 1
-                    for name in node.plain.table.params.keys() & GROUND_STATION_PARAMS:
-                        self.avoid(node.plain.table.params[name].value)
+                    params = node.plain.table.params
+                    for name in params.keys() & GROUND_STATION_PARAMS:
+                        last = params.get(f"{name}_HI", params[name])
+                        self.avoid(float(params[name].value), float(last.value))
                 self._gateway.pass_on(self, seen, peer)
 
-    def avoid(self, system: object) -> None:
-        """Take another system id if a ground station has ours, or a vehicle watches it as that of one."""
+    def avoid(self, first: float, last: float = 0.0) -> None:
+        """Take another system id if ground stations have ours, or a vehicle watches it as that of one."""
         own, component = self._station.own_address
-        if own == system:
-            systems = {source[0] for each in self._gateway.stations for source in each.sources}
-            free = (each for each in range(own - 1, 0, -1) if each not in systems | self.systems)
+        if first <= own <= max(first, last):
+            systems = {source[0] for each in self._gateway.stations for source in each.sources} | self.systems
+            free = (each for each in range(own - 1, 0, -1) if each < first and each not in systems)
             self._station.own_address = (next(free, own), component)
 
     def is_vehicle(self, source: Source) -> bool:

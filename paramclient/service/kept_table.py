@@ -405,7 +405,7 @@ class KeptTable(Stream[Change]):
         key = newest if newest[:3] == wanted else (*wanted, newest[3] + 1)
         if asker.station.endpoint.is_readonly:
             self._reject([asker], key, ParamErrorCode.READ_ONLY)
-        elif self._is_unknown(message.param_id):
+        elif not self.known(message.param_id) and self._is_unknown(message.param_id):
             self._reject([asker], key, ParamErrorCode.DOES_NOT_EXIST)
         elif self._sets.begins(key, asker):
             self.component.core.spawn(self._set, key, asker)

@@ -234,6 +234,16 @@ async def test_rule_2_an_unknown_name_is_known_to_be_unknown_in_3_seconds_also_w
         assert len(requested(vehicle)) == asked
 
 
+async def test_rule_2_a_name_that_the_vehicle_has_by_now_is_not_unknown() -> None:
+    also = Puppet(lambda message: (), heartbeat=None)
+    async with in_sync(Air([small_px4(param_error=True), also])) as (_, vehicle, station):
+        await station.ask(ParamRequestRead(1, 1, "NEW", -1))
+        also.say(ParamValue("NEW", bytes(4), ParamType.INT32, 25, 65535))
+        await station.ask(GCS)
+        await station.ask(set_to("NEW", 5))
+        assert set_to("NEW", 5) in requested(vehicle)
+
+
 async def test_rule_2_extended_parameters() -> None:
     camera = Tap(Camera())
     wanted = answers_of(Camera(), messages.ParamExtValue, messages.ParamExtRequestList(1, 100))
@@ -887,13 +897,17 @@ async def test_rule_8_no_set_is_signed_for_an_unsigned_station_where_the_vehicle
 # 9: no ground station
 
 
-async def test_rule_9_the_gateway_is_no_ground_station() -> None:
-    async with in_sync(ArduPilotVehicle(table={"SYSID_MYGCS": 254.0, "A": 1.0})) as (_, vehicle, _):
+RANGE = {"MAV_GCS_SYSID": 200.0, "MAV_GCS_SYSID_HI": 255.0}
+
+
+@pytest.mark.parametrize(("table", "own"), [({"SYSID_MYGCS": 254.0, "A": 1.0}, 253), (RANGE, 199)])
+async def test_rule_9_the_gateway_is_no_ground_station(table: dict[str, float], own: int) -> None:
+    async with in_sync(ArduPilotVehicle(table=table)) as (_, vehicle, _):
         await anyio.sleep(3.0)
         vehicle.received.clear()
         await anyio.sleep(3.0)
         assert {each.type for each in vehicle.messages(messages.Heartbeat)} == {18}
-        assert {frame.system for _, frame, _ in vehicle.received} == {253}
+        assert {frame.system for _, frame, _ in vehicle.received} == {own}
 
 
 async def test_rule_9_the_gateway_has_the_id_of_no_station() -> None:
