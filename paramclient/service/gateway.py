@@ -155,7 +155,7 @@ class Gateway:
             if command == messages.MAV_CMD_PREFLIGHT_STORAGE:
                 for link in self.links:
                     for table in link.tables(_target_of(frame), COMP_ID_ALL, extended=False):
-                        table.component.watch.doubt()  # it may reset all, which PX4 does not announce
+                        table.doubt()  # it may reset all, which PX4 does not announce
 
     def _answer(self, station: GroundStation, source: Source, message: Request, seen: SeenFrame) -> bool:
         """Answer a request about parameters; return False for one that passes to the vehicles.

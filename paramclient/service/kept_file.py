@@ -11,7 +11,7 @@ import anyio
 
 from paramclient.errors import FileErrorCode
 from paramclient.model.px4_hash import crc32_px4
-from paramclient.model.values import ParamType, bits_of
+from paramclient.model.values import ParamType, Trust, bits_of
 from paramclient.protocol.checksum import CHECKED_READ_SIZE, may_be_rounded
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode
@@ -73,7 +73,7 @@ def rows_of(session: Session) -> Rows | None:
     table, entries = session.table, []
     params = [table.params[name] for _, name in sorted(table.names.items())]
     for param in params:
-        if param.is_raw or param.type not in PACKABLE:
+        if param.is_raw or param.type not in PACKABLE or param.trust is Trust.CACHED:
             return None
         default = None
         if param.default is not None and param.is_changed:
@@ -88,14 +88,9 @@ def reply(
     request: Packet, data: bytes = b"", *, error: FileErrorCode | None = None, offset: int = 0, step: int = 1
 ) -> Packet:
     """Return the answer to a request: ACK with data, or NAK with an error."""
-    return Packet(
-        (request.sequence + step) & 0xFFFF,
-        request.session,
-        Opcode.ACK if error is None else Opcode.NAK,
-        data if error is None else bytes((error,)),
-        offset=offset,
-        requested=request.opcode,
-    )
+    sequence = (request.sequence + step) & 0xFFFF
+    opcode, data = (Opcode.ACK, data) if error is None else (Opcode.NAK, bytes((error,)))
+    return Packet(sequence, request.session, opcode, data, offset=offset, requested=request.opcode)
 
 
 def answers_of(request: Packet, content: bytes) -> Iterator[Packet]:
@@ -155,7 +150,7 @@ class KeptFile:
                 same = 3 if request.opcode == Opcode.RESET_SESSIONS else 4  # members of the key
                 closed = [files.pop(each) for each in list(files) if each[:same] == key[:same]]
                 if any(isinstance(each, FileQuery) for each in closed):
-                    self._table.component.watch.doubt()
+                    self._table.doubt()
                 is_aboard = not all(isinstance(each, _OpenFile) for each in closed)
                 if not is_aboard and (closed or (self._is_served and self._table.is_loading)):
                     self._say(asker, reply(request))

@@ -24,7 +24,7 @@ from paramclient.model.values import (
     ext_bytes,
 )
 from paramclient.protocol.dialect import ReportedValue
-from paramclient.protocol.reads import read
+from paramclient.protocol.reads import read, read_again
 from paramclient.protocol.session import Session
 from paramclient.protocol.table import Change
 from paramclient.protocol.watch import SyncState
@@ -244,6 +244,11 @@ class KeptTable(Stream[Change]):
         """Have a table checked in the background that was not confirmed for a while."""
         self.component.watch.check(older_than=PROOF_AGE_MAX)
 
+    def doubt(self) -> None:
+        """Have the table checked, and serve none of its values before: something may have changed them."""
+        self.component.watch.doubt()
+        self.session.table.doubt()
+
     def push(self, item: Change) -> None:
         """Take a change, and announce it unless it is a first value."""
         self.changes += 1
@@ -426,6 +431,11 @@ class KeptTable(Stream[Change]):
             askers = self._sets.end(key)
         if code:
             self._reject(askers, key, code)
+        name = self.session.spelled(key[0])
+        if code == ParamErrorCode.COMPONENT_NOT_FOUND and (known := known_param(self.session, name)):
+            self.session.table.params[name] = known.with_trust(Trust.CACHED)  # it may have the new value
+            self.changes += 1
+            self.component.core.spawn(read_again, self.session, name, anyio.current_time())
 
     async def _write(self, key: SetKey, author: str, scope: anyio.CancelScope) -> ParamErrorCode:
         """Write a value, and acknowledge it to the askers.

@@ -22,12 +22,10 @@ import pytest
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer, create_link, link, sockets
 from paramclient.wire import messages
-from tests.cable import Cable
+from tests.cable import TIMEOUT, Cable
 
 pytestmark = pytest.mark.asyncio
 HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
-TIMEOUT = 20.0
-"""Seconds after which a test fails; a passing test never waits that long."""
 
 
 def frame(number: int) -> bytes:
@@ -223,19 +221,14 @@ async def test_udpin_and_udpout_communicate(host: str) -> None:
         opened(f"udpin:{shown}:0") as station,
         opened(f"udpout:{shown}:{station.address[1]}") as vehicle,
     ):
-        assert station.address[0] == host
         await vehicle.send(HEARTBEAT, None)
         peer: Any
         far: Any
         [(peer, data)] = await collect(station, 1)
-        assert data == HEARTBEAT
-        assert peer[:2] == (host, vehicle.address[1])
+        assert (data, peer[:2]) == (HEARTBEAT, (host, vehicle.address[1]))
         await station.send(frame(1), peer)
         [(far, data)] = await collect(vehicle, 1)
-        assert data == frame(1)
-        assert far[:2] == station.address
-        await vehicle.send(frame(2), far)
-        assert await collect(station, 1) == [(peer, frame(2))]
+        assert (data, far[:2]) == (frame(1), station.address)
 
 
 @pytest.mark.parametrize("kind", ["udpin", "udpout", "tcp", "tcpin"])

@@ -48,15 +48,10 @@ def test_autopilots_are_first_then_usb_devices(monkeypatch: pytest.MonkeyPatch) 
         (0x26AC, 0x0015, "3D Robotics", None),
         (0x2DAE, 0x1058, "CubePilot", "CubePilot"),
         (0x1209, 0x5740, "ArduPilot", "ArduPilot"),
-        (0x1209, 0x0001, "Example Robotics", None),
         (0x0483, 0x5740, "mRo", "mRo"),
         (0x0483, 0x5740, "STMicroelectronics", None),
-        (0x10C4, 0xEA60, "Silicon Labs", None),
-        (None, None, None, None),
     ],
 )
-def test_detection_of_autopilots(
-    vendor: int | None, product: int | None, manufacturer: str | None, autopilot: str | None
-) -> None:
+def test_detection_of_autopilots(vendor: int, product: int, manufacturer: str, autopilot: str | None) -> None:
     port = SerialPort("COM5", vendor_id=vendor, product_id=product, manufacturer=manufacturer)
     assert port.autopilot == autopilot

@@ -22,12 +22,11 @@ import serialx
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, link, serial
 from paramclient.links.serial import open_asyncio
-from paramclient.wire import messages
 from tests.cable import TIMEOUT, Cable
+from tests.links.test_links import HEARTBEAT
 from tests.shell import a_client, bits, generic, until
 
 pytestmark = pytest.mark.asyncio
-HEARTBEAT = messages.encode(messages.Heartbeat(6, 8), system=255, component=190, sequence=0)
 RATE = 40_000.0
 """Bytes per second in each direction. With 57600 baud (5,760 bytes per second), tests would take seconds."""
 

@@ -505,7 +505,8 @@ async def test_rule_3_the_hash_is_answered_in_under_a_second_before_the_table_is
 async def test_rule_3_no_value_is_served_or_set_in_doubt(autopilot: int, raw: bytes, beat_at: int) -> None:
     """The first heartbeat may wait behind a list; 120.0 of an ArduPilot is another number byte by byte."""
     values = [ParamValue(f"INT_{index}", raw, ParamType.INT32, 2, index) for index in range(2)]
-    vehicle = Puppet(lambda message: values * isinstance(message, ParamRequestList), heartbeat=None)
+    answers = {ParamRequestList: values, ParamRequestRead: values[:1]}
+    vehicle = Puppet(lambda message: answers.get(type(message), []), heartbeat=None)
     async with gateway_over(vehicle) as served:
         station = served.partner()
         station.send(GCS)
@@ -540,6 +541,18 @@ async def test_rule_3_cached_values_are_never_served(tmp_path: Path) -> None:
         station = served.partner()
         await station.ask(LIST, ParamRequestRead(1, 1, "PARAM_01", -1), seconds=2.0)
         assert not station.of(ParamValue)
+
+
+async def test_rule_3_a_value_is_not_served_after_a_set_without_an_answer() -> None:
+    """It may be the new one."""
+    async with in_sync(small_px4()) as (_, vehicle, station):
+        assert await listed(station) == 26
+        vehicle.is_mute = True
+        await station.ask(set_to("PARAM_01", 5), seconds=3.0)
+        assert await listed(station, 0.1) == 25
+        vehicle.is_mute = False
+        await station.ask(seconds=2.0)
+        assert by_name(station) == {"PARAM_01": struct.pack("<i", 5)}
 
 
 async def test_rule_3_a_lost_vehicle_is_silent() -> None:
@@ -1170,8 +1183,9 @@ async def test_a_silent_reset_by_a_station_is_found() -> None:
         for number, value in ((76, 1), (75, 2)):  # COMMAND_LONG, COMMAND_INT
             model.load({"PARAM_01": value})
             station.send_bytes(frames.build_frame(number, reset, system=255, component=190, sequence=value))
-            await station.ask(seconds=3.0)
-            assert by_name(station)["PARAM_01"] == struct.pack("<i", value)
+            await station.ask(LIST, ParamRequestRead(1, 1, "PARAM_01", -1), seconds=3.0)
+            values = {each.raw for each in station.of(ParamValue) if each.param_id == "PARAM_01"}
+            assert values == {struct.pack("<i", value)}
 
 
 async def test_a_restart_during_a_list() -> None:
