@@ -26,8 +26,7 @@ def test_every_error_can_be_caught_as_what_python_calls_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("prefix", "codes"),
-    [("MAV_PARAM_ERROR_", errors.ParamErrorCode), ("MAV_FTP_ERR_", errors.FileErrorCode)],
+    ("prefix", "codes"), [("MAV_PARAM_ERROR_", errors.ParamErrorCode), ("MAV_FTP_ERR_", errors.FileErrorCode)]
 )
 def test_codes_match_pymavlink(prefix: str, codes: type[IntEnum]) -> None:
     """Codes 6 to 8 of PARAM_ERROR are newer than pymavlink's dialect."""

@@ -329,16 +329,16 @@ def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool
 def encoding_of(raw: bytes, number: int) -> Encoding | None:
     """Return the encoding that the four wire bytes of an integer show; None of 0, and of other types.
 
-    A whole float32 that fits the type is cast: as bytes, it would be a number beyond 1,000,000,000, and a
-    short type has no such bytes at all. All else is byte by byte: as a float32, it would be a fraction, too
-    large or no number.
+    A whole float32 that fits the type is cast: as bytes, it would be a number beyond 1,000,000,000. All else
+    is byte by byte: as a float32, it would be a fraction, too large or no number.
     """
     bounds = _BOUNDS.get(number)
     if bounds is None or number >= ParamType.UINT64 or raw == bytes(WIRE_SIZE):
         return None
     number32: float = _FLOAT32.unpack(raw)[0]
     low, high = bounds
-    fits = number < ParamType.UINT32 or low <= number32 <= high + 1  # float32 rounds the largest up
+    # float32 rounds the largest up; a short type may be cast beyond its bounds, and its unused bytes be any.
+    fits = low <= number32 <= high + 1 or (number < ParamType.UINT32 and abs(number32) <= 0xFFFFFF)
     return Encoding.C_CAST if fits and number32.is_integer() else Encoding.BYTEWISE
 
 

@@ -74,8 +74,7 @@ class Progress:
     def after(cls, received: int, total: int | None, elapsed: float) -> Progress:
         """Return the progress `elapsed` seconds after the begin."""
         rate = received / elapsed if elapsed >= PROGRESS_RATE_TIME_MIN else 0.0
-        left = (total - received) / rate if rate and total is not None else None
-        return cls(received, total, rate, left)
+        return cls(received, total, rate, (total - received) / rate if rate and total is not None else None)
 
 
 @dataclass(frozen=True, slots=True)

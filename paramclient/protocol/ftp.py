@@ -284,8 +284,7 @@ async def _close(channel: Channel, path: str, session: int | None, opening: int)
         if session is None:
             with suppress(FileTransferError):
                 data = path_bytes(path)
-                answer = await _request(channel, Opcode.OPEN_FILE_RO, path, data, sequence=opening)
-                session = answer.session
+                session = (await _request(channel, Opcode.OPEN_FILE_RO, path, data, sequence=opening)).session
         await _request(channel, Opcode.TERMINATE_SESSION, path, session=session or 0)
 
 

@@ -282,7 +282,8 @@ class _Download:
                 await channel.exchange(
                     request, inbox, accept, what=what, attempts=attempts_max, copies=copies
                 )
-                self.session.serves_reads[int] = True
+                if self.reads_beside or not channel.is_streaming:  # else it may be of a list that runs again
+                    self.session.serves_reads[int] = True
             except NoReply as error:
                 attempts = error.attempts if error.attempts < most else ATTEMPTS_MAX
         await self._take_received()

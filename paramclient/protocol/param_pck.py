@@ -82,8 +82,7 @@ def decode(data: bytes, *, checks_names: bool = True) -> Pack:
     """
     pack, number = decode_prefix(data, checks_names=checks_names)
     if len(pack.entries) < number:
-        what = f"the file is cut off: {len(pack.entries)} of {number} entries"
-        raise PackError(what, offset=len(data))
+        raise PackError(f"the file is cut off: {len(pack.entries)} of {number} entries", offset=len(data))
     return pack
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from typing import Final
 
 import anyio
@@ -243,7 +243,9 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
     same = live.pop(which, None) if isinstance(which, str) else None
     known: Iterable[str | int | None] = live.values() if _reads_by_index(session) else [*live]
     likely: str | int = next((each for each in known if each), 1) if same is None else same
-    async with session.control:
+    async with nullcontext() if session.serves_reads.get(type(which)) else session.control:
+        while None in session.reading:  # noqa: ASYNC110 - the values of a list would be taken for the answers
+            await anyio.sleep(session.channel.timing.timeout(0))
         control = await _try(session, likely) or await _try(session, 0)  # the indices may be 0, 2, 4, …
         is_proven = not isinstance(which, str) or session.serves_reads.get(str)
         if control is None or is_proven or control.param_id == which:
@@ -251,8 +253,8 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
         if str not in session.serves_reads:
             await anyio.sleep(session.channel.timing.timeout(0))  # for its other answers
             await _try(session, control.param_id)
-        session.only_by_index = not session.serves_reads.get(str)
-        return None if session.only_by_index else control
+        session.only_by_index = session.serves_reads.get(str) is False
+        return control if session.serves_reads.get(str) else None
 
 
 async def _try(session: Session, which: str | int) -> ReportedValue | None:

@@ -263,8 +263,7 @@ class Session:
         names in capitals only. A name that is listed in lower case stays.
         """
         has_capitals = self.identification.is_ardupilot or self.identification.is_px4
-        is_open = has_capitals and name.isascii() and name not in self.table.params
-        return name.upper() if is_open else name
+        return name.upper() if has_capitals and name.isascii() and name not in self.table.params else name
 
     async def confirm(self, vehicles: int) -> None:
         """Wait until the link is open, and until it is certain that the same vehicle still uses the address.

@@ -29,8 +29,8 @@ SEEK_MAX: Final = 20
 """Requests for the heartbeat of one system: it may be no vehicle, or serve no such request."""
 HEARTBEAT_INTERVAL: Final = 1.0
 """Seconds between two heartbeats of ours, by the standard."""
-PROBES: Final = 5
-"""Ways to find a component that was not heard; the last one is that of components under another address."""
+PROBES: Final = 6
+"""Ways to find a component that was not heard; the last two are that of components under another address."""
 COMPONENTS_MAX: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each."""
 STREAM_PEERS_MAX: Final = 256
@@ -158,7 +158,7 @@ class Station:
             PLAIN.request_list(target),
             PLAIN.request_read(target, 1),
             EXTENDED.request_read(target, 0),
-            PLAIN.request_read((system, messages.AUTOPILOT_COMPONENT), 0),
+            *[PLAIN.request_read((system, messages.AUTOPILOT_COMPONENT), 0)] * 2,  # an answer may be late
         )
         self.transmit(ways[number % PROBES], None, next((node.version for node in self.nodes.values()), 2))
 
@@ -255,6 +255,9 @@ class Station:
             if not isinstance(message, _SIGNS) or len(self.nodes) >= COMPONENTS_MAX:
                 return
             node = self._add(address, peer, now)
+            number = self._asked.get((system, component), 0) % PROBES
+            if number >= PROBES - 2 and isinstance(message, messages.ParamValue):  # the answer to a probe
+                node.channel.reads_from = (system, messages.AUTOPILOT_COMPONENT)
         if peer != node.peer:
             if not self._moves(node, peer, message, now):
                 return
@@ -306,8 +309,6 @@ class Station:
             listens_only=self.listens_only,
             spawn=self.spawn,
         )
-        if self._asked.get((node.system, node.component), 0) % PROBES == PROBES - 1:
-            node.channel.reads_from = (node.system, messages.AUTOPILOT_COMPONENT)
         self.nodes[address] = node
         self.discovered(node)
         self.spawn(node.watch_presence)

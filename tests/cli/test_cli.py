@@ -209,10 +209,7 @@ def test_fetch_names_what_has_changed_since_an_ardupilot_was_cached(
 
 
 def test_watch_prints_lines_of_json_as_values_change(live_command: Command, tmp_path: Path) -> None:
-    with (
-        simulated("px4") as url,
-        process("watch", url, "MC_ROLL_P", "--json", "--no-cache") as watching,
-    ):
+    with simulated("px4") as url, process("watch", url, "MC_ROLL_P", "--json", "--no-cache") as watching:
         assert line_of(watching.stderr) == "watching MC_ROLL_P of 1/1 px4\n"
         done = live_command("set", url, "MC_PITCH_P", 7, "MC_ROLL_P", "nan", "--force", "--no-cache")
         assert done.code == 0
@@ -484,7 +481,7 @@ def test_the_help_of_fetch_fits_on_a_screen_with_the_connection_last() -> None:
     lines = run_process("fetch", "--help", env={**PLAIN, "COLUMNS": "80"}).out.splitlines()
     assert len(lines) <= 50
     assert [line.split()[1] for line in lines if line.startswith("╭")] == [
-        *("Arguments", "Parameters", "Connection"),
+        *("Arguments", "Parameters", "Connection")
     ]
 
 

@@ -96,8 +96,5 @@ def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
     found = command(*words, "--json").json
     assert {
         name: (each["changed_side"], each["default_source"]) for name, each in found["params"].items()
-    } == {
-        "MC_PITCH_P": ("right", "metadata"),
-        "MC_ROLL_P": ("left", "metadata"),
-    }
+    } == {"MC_PITCH_P": ("right", "metadata"), "MC_ROLL_P": ("left", "metadata")}
     assert "2 of 2 from the metadata" in found["base"]["source"]

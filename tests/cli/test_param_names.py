@@ -12,12 +12,7 @@ from tests.commands import Command, Put
 from tests.shell import Eventful
 
 URL = "sim:px4"
-TABLE: dict[str, Any] = {
-    "MC_ROLL_P": 4.0,
-    "MC_PITCH_P": 4.5,
-    "MC_YAW_P": 2.5,
-    "SYS_AUTOSTART": 4001,
-}
+TABLE: dict[str, Any] = {"MC_ROLL_P": 4.0, "MC_PITCH_P": 4.5, "MC_YAW_P": 2.5, "SYS_AUTOSTART": 4001}
 NAMES = ("mc_*", "sys_autostart")
 """All of these."""
 

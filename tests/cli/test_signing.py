@@ -99,11 +99,7 @@ class Ignorant(PX4Vehicle):
 
 def test_a_vehicle_that_does_not_obey_is_found_out(put: Put, key_file: Path, command: Command) -> None:
     for key, words, text in (
-        (
-            None,
-            ["setup", "--signing-key", key_file],
-            "requests signed with the key, or unsigned: no ",
-        ),
+        (None, ["setup", "--signing-key", key_file], "requests signed with the key, or unsigned: no "),
         (KEY, ["disable"], "1/1 still signs"),
     ):
         url = put(Ignorant(table=VALUES, signing_key=key, usb=True))

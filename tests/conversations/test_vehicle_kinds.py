@@ -16,7 +16,7 @@ from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire import messages
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
-from tests.conversations.virtual import QUIET, Puppet, Tap, talking, virtual_on_both
+from tests.conversations.virtual import QUIET, Puppet, Tap, meanwhile, talking, virtual_on_both
 
 ARDUPILOT = messages.Heartbeat(2, 3, system_status=4)
 PX4 = messages.Heartbeat(2, 12, system_status=4)
@@ -224,6 +224,26 @@ async def test_an_unknown_name_of_a_px4_without_hash_is_unknown(serves: tuple[st
         assert anyio.current_time() < 15.0
 
 
+async def test_an_unknown_name_beside_a_fetch_costs_no_list_of_its_own() -> None:
+    vehicle = PX4Vehicle()
+    async with talking(Air.symmetric([vehicle], delay=0.05)) as (_, session):
+        async with meanwhile(read(session, "NOPE"), read(session, "MC_ROLL_P")) as outcomes:
+            await fetch_all(session)
+        assert isinstance(outcomes[1], errors.UnknownParameter)
+        assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
+
+
+async def test_values_of_a_repeated_list_are_no_answers_to_reads_by_index() -> None:
+    vehicle = Partial(serves=("list", "sets", "acks"))
+
+    def down(message: messages.Message) -> bool:
+        lost_in = {"MODE": 3, "OFFSET": 1}.get(getattr(message, "param_id", ""), -1)
+        return vehicle.number_of(messages.ParamRequestList) > lost_in
+
+    async with talking(Air.symmetric([Tap(vehicle, down=down)], delay=0.15)) as (_, session):
+        assert (await write(session, "MODE", 4)).status == "accepted"
+
+
 @pytest.mark.parametrize("heartbeat", [ARDUPILOT, QUIET, PX4], ids=["AP", "generic", "PX4"])
 @pytest.mark.parametrize("parts", [("list", "sets"), ("list", "sets", "acks")], ids="+".join)
 @virtual_on_both
@@ -317,6 +337,15 @@ async def test_a_component_without_heartbeat_is_found_by_both_ids(
         with pytest.raises(errors.NoReply):
             await client.component(component=242)
         assert await client.only_component(1, 240) is component
+
+
+async def test_a_component_that_starts_late_is_asked_under_its_own_id() -> None:
+    def is_on(message: messages.Message) -> bool:
+        return anyio.current_time() > 5.0  # its heartbeat arrives behind a probe of the autopilot's id
+
+    late = Tap(Partial(component=240), up=is_on, down=is_on)
+    async with ParamClient(Air.symmetric([GenericVehicle({"A": 1}), late]), cache=False) as client:
+        assert (await (await client.component(1, 240, timeout=20)).get("MODE")).value == 5
 
 
 async def test_values_under_another_id_are_named_and_can_be_read() -> None:

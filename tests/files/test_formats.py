@@ -393,10 +393,7 @@ RECORDED = {
 
 @pytest.mark.parametrize(
     ("data", "kind"),
-    [
-        *((data, kind) for kind, data in KINDS),
-        *((DATA / name, kind) for name, kind in RECORDED.items()),
-    ],
+    [*((data, kind) for kind, data in KINDS), *((DATA / name, kind) for name, kind in RECORDED.items())],
 )
 def test_a_file_of_another_program_is_named(data: bytes | str | Path, kind: str) -> None:
     error = failed(data.read_bytes() if isinstance(data, Path) else data)
@@ -418,7 +415,7 @@ ROWS = {
     "A,1\n?\nB,2\n": [*(f"{name},0" for name in BAD_NAMES), "C,one", "C", "C,1,5", "C,1e999", "C,1 m"],
     "1\t1\tA\t1\t6\n1\t1\t?\n1\t1\tB\t2\t6\n": [*(f"{name}\t0\t6" for name in BAD_NAMES), "C\t1e39\t9", "C"],
     '{"paramclient": 1, "sets": [{"params": {"A": {"value": 1},\n?, "B": {"value": 2}}}]}': [
-        *('"SIM_GPS1_BYTELOSS": {}', '"C": {"value": 300, "type": "INT8"}', '"C": {"value": "x"}', '"C": 1'),
+        *('"SIM_GPS1_BYTELOSS": {}', '"C": {"value": 300, "type": "INT8"}', '"C": {"value": "x"}', '"C": 1')
     ],
 }
 
@@ -573,10 +570,7 @@ def test_an_invalid_field_is_rejected(fields: str, problem: str) -> None:
     [
         ("{", "expected JSON"),
         ("{}", "not a parameter file of paramclient (JSON)"),
-        (
-            '{"paramclient": 2, "units": []}',
-            "a newer paramclient wrote it, in version 2 of",
-        ),
+        ('{"paramclient": 2, "units": []}', "a newer paramclient wrote it, in version 2 of"),
         ('{"paramclient": 0, "sets": []}', "it should be 1, the version of the format, found 0"),
         ('{"paramclient": 1, "sets": []}', "contains no parameters"),
         ('{"paramclient": 1, "sets": [{"at": "2026-01-31T12:00:00", "params": {}}]}', "needs its zone"),

@@ -39,10 +39,7 @@ def file_of(document: object) -> bytes:
 
 def publish(vehicle: PX4Vehicle, **entry: Any) -> None:
     """Replace the entry of the parameter metadata in a vehicle's general file."""
-    kinds = [
-        {"type": 1, "uri": f"mftp://{METADATA_FILE}"} | entry,
-        {"type": 4, "uri": "https://x.invalid/e"},
-    ]
+    kinds = [{"type": 1, "uri": f"mftp://{METADATA_FILE}"} | entry, {"type": 4, "uri": "https://x.invalid/e"}]
     vehicle.files[GENERAL_FILE] = file_of({"version": 1, "metadataTypes": kinds})
 
 

@@ -40,10 +40,7 @@ UNASKED = (
 """Values that the firmware changes and announces on its own; only those in a list are compared."""
 
 
-COMMITS = {
-    b"fbb78585": b"5eed5eed",
-    bytes.fromhex("0000009383550aa7"): bytes.fromhex("ed5eed5eed5eed5e"),
-}
+COMMITS = {b"fbb78585": b"5eed5eed", bytes.fromhex("0000009383550aa7"): bytes.fromhex("ed5eed5eed5eed5e")}
 """The commits of the recorded autopilots, and those that the simulated ones report instead."""
 
 
