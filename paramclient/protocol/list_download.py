@@ -19,7 +19,7 @@ from paramclient.protocol.channel import (
 )
 from paramclient.protocol.dialect import Digest
 from paramclient.protocol.session import Session
-from paramclient.wire.messages import HASH_CHECK, Message, ParamError
+from paramclient.wire.messages import HASH_CHECK, PARAMETERS_MAX, Message, ParamError
 
 LIST_REQUESTS_MAX: Final = 12
 """Requests for a list that does not begin: an ArduPilot ignores them early after its start."""
@@ -307,7 +307,7 @@ class _Download:
             gaps |= {0, count, count + (0 not in self._received)}
         elif 0 in gaps and self._is_given_up(0):
             gaps.add(count)
-        return sorted(gaps - self._received)
+        return sorted(index for index in gaps - self._received if index < PARAMETERS_MAX)
 
     def _may_begin_again(self) -> bool:
         """Return whether the list may run once more, as it was requested again before it began."""
