@@ -85,9 +85,12 @@ async def restore(component: Component, state: Wanted, **options: Unpack[ApplyOp
 
 
 def is_own_state(component: Component, state: ParamSet) -> bool:
-    """Return whether a state is one of this very vehicle: `restore` then includes `OWN_STATE_CATEGORIES`."""
+    """Return whether a state is one of this very vehicle: `restore` then includes `OWN_STATE_CATEGORIES`.
+
+    The hardware id decides, on whatever link; also that of a simulator.
+    """
     origin, own = state.identity, component.identity
-    return origin is not None and origin.uid == own.uid and origin.is_same_vehicle(own)
+    return origin is not None and origin.uid == own.uid and (bool(own.uid) or origin.is_same_vehicle(own))
 
 
 async def restore_categories(component: Component, state: ParamSet) -> tuple[str, ...]:

@@ -458,10 +458,8 @@ def test_an_interrupted_restore_is_continued_by_its_number(command: Command, put
     assert (outcome.code, next_command in outcome.err) == (130, True)
     assert set(vehicle.values.values()) == {1, 2}
     again = command("restore", put(vehicle))
-    assert (again.code, "snapshot 1 for the state before that apply, also to continue" in again.err) == (
-        2,
-        True,
-    )
+    assert again.code == 2
+    assert "snapshot 1 for the state before that apply, also to continue" in again.err
     back = command("restore", put(vehicle), 1, "--vehicle", "1/1")
     assert (back.code, set(vehicle.values.values())) == (0, {1})
 

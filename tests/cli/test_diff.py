@@ -145,7 +145,6 @@ def test_only_compares_the_named_parameters(command: Command) -> None:
     [
         (["9", "1"], "9 is not in the cache"),
         (["1", "1", "--vehicle", "1/9"], "which has 1/1 (uid:aa00000000000001)"),
-        (["quad.params", "1"], "no such file: quad.params, nor a vehicle in the cache (cache:VEHICLE)\n"),
         (["udpin:x", "1"], "(cache:VEHICLE); link name 'udpin:x': "),
         (["", "1"], "no such file"),
         (["cache:", "1"], "needs a name"),

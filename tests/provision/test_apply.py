@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -19,6 +20,7 @@ from paramclient.model.paramset import ParamSet
 from paramclient.model.values import ParamType
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.provision import MISSING, ApplyProgress, ApplyResult, ApplyStatus, apply, plan, restore
+from paramclient.provision.apply_restore import restore_categories
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
 from paramclient.wire import frames, messages
 from tests.shell import FlakyLink, Tap, a_client, clamped, in_simulated_time, residue
@@ -259,6 +261,14 @@ async def test_the_state_of_another_vehicle_is_refused() -> None:
             await restore(component, unknown)
         with pytest.raises(UsageError, match=r"X_19: not on this vehicle\nand 30 more$"):
             await apply(component, unknown)
+
+
+async def test_a_simulator_has_the_hardware_id_of_its_state_on_another_link() -> None:
+    async with a_client(px4()) as client:
+        component = await client.component()
+        await apply(component, {})  # identifies it
+        state = ParamSet({}, identity=replace(component.identity, link="udpin:0.0.0.0:14559"))
+        assert "calibration" in await restore_categories(component, state)
 
 
 async def test_a_vehicle_armed_during_the_run_ends_it() -> None:
