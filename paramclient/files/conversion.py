@@ -16,10 +16,10 @@ from paramclient.files import json_format, lists
 from paramclient.files.disk import LARGEST_FILE, read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, format_of_name
 from paramclient.files.reading import LACKS, UTF16_MARKS, Reading
-from paramclient.model.identity import check_ids, version_text
+from paramclient.model.identity import version_text
 from paramclient.model.names import counted, first_of
 from paramclient.model.notation import time_text
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.paramset import ParamSet, WrittenParam, set_of
 from paramclient.model.values import Param, ParamType, Settable, bits_of, check_name, from_bits, same_bits
 from paramclient.protocol import param_pck
 
@@ -263,9 +263,9 @@ def writable(params: ParamSet, file_format: FileFormat) -> tuple[ParamSet, list[
 
 
 def _as_file(content: Mapping[str, Any] | Iterable[ParamSet], file_format: FileFormat) -> ParamFile:
-    if isinstance(content, Mapping) and not isinstance(content, ParamSet):
-        content = ParamSet(content)
-    sets = (content,) if isinstance(content, ParamSet) else tuple(content)
+    sets = (set_of(content),) if isinstance(content, Mapping) else tuple(content)
+    if wrong := [each for each in sets if not isinstance(each, ParamSet)]:
+        raise TypeError(f"{wrong[0]!r} is not a ParamSet, nor are these parameters by name")
     untold = () if file_format is FileFormat.JSON else sets  # the document has fields for the header's facts
     return ParamFile(sets, file_format, header=tuple(line for each in untold for line in _header_lines(each)))
 
@@ -293,7 +293,6 @@ def _check(sets: Sequence[ParamSet], file_format: FileFormat) -> None:
         raise UsageError(f"the format {file_format} holds one component, and there are {there}; choose one")
     seen = set()
     for each in sets:
-        check_ids(each.system, each.component)
         for param in each.values():
             check_name(param.name)
         ids = (each.system, AUTOPILOT if each.component is None else each.component)

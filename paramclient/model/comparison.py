@@ -12,7 +12,7 @@ from enum import StrEnum
 
 from paramclient.errors import UsageError
 from paramclient.model.names import NameChoice
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.paramset import AnyParams, ParamSet, WrittenParam, set_of
 from paramclient.model.values import ParamType, Value, bits_of, from_bits, same_bits
 
 
@@ -127,15 +127,16 @@ class Comparison:
 
 
 def compare(
-    left: ParamSet,
-    right: ParamSet,
+    left: AnyParams,
+    right: AnyParams,
     *,
-    base: ParamSet | None = None,
+    base: AnyParams | None = None,
     names: Iterable[str] | None = None,
 ) -> Comparison:
     """Compare two sets with `same_value`.
 
     Args:
+        left, right: the sets, which may also be tables, or plain values by name.
         base: a third set, to determine which side differs from it: an earlier state, or `defaults_of` both.
             Names that only the base has are ignored.
         names: names or shell patterns (`MC_*`, `SERVO?_TRIM`), case-sensitive, to compare only the names
@@ -145,6 +146,7 @@ def compare(
         UsageError: a pattern matches no name of either side. Without this error, a misspelt name would
             compare as equal.
     """
+    left, right, base = set_of(left), set_of(right), None if base is None else set_of(base)
     chosen = left.keys() | right.keys()
     if names is not None:
         given = [names] if isinstance(names, str) else names
@@ -246,6 +248,5 @@ def _bits(value: Value, number: ParamType | int) -> int | None:
 def _same_number(left: Value, right: Value) -> bool:
     """Return whether two numbers are equal as written; NaN by its bits."""
     if isinstance(left, float) and isinstance(right, float):
-        kind = ParamType.REAL64
-        return same_bits(kind, bits_of(left, kind), bits_of(right, kind))
+        return same_bits(ParamType.REAL64, *(bits_of(each, ParamType.REAL64) for each in (left, right)))
     return bool(left == right)

@@ -104,10 +104,8 @@ def check_ids(system: int | None, component: int | None, least: int = 0) -> None
 
 def is_sitl_uid(uid: str | None) -> bool:
     """Return whether a hardware id is one that PX4's SITL makes of its system id; see `PX4_SITL_UID`."""
-    if uid is None:
-        return False
-    if len(uid) == _UID2_DIGITS:
-        return uid[2:].count("0") == _UID2_DIGITS - 2
+    if uid is None or len(uid) == _UID2_DIGITS:
+        return uid is not None and uid[2:].count("0") == _UID2_DIGITS - 2
     return len(uid) == _UID_DIGITS and 0 <= int(uid, 16) - int(PX4_SITL_UID, 16) < _SITL_SYSTEMS_MAX
 
 

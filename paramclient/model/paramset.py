@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from types import MappingProxyType
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 from paramclient.errors import UsageError
-from paramclient.model.identity import Identity, autopilot_name
+from paramclient.model.identity import Identity, autopilot_name, check_ids
 from paramclient.model.names import ByName, NameChoice, counted
 from paramclient.model.values import (
     WIRE_SIZE,
@@ -101,12 +101,14 @@ class WrittenParam:
         return f"{self.name} = {format_value(self.settable, kind)}"
 
 
+AnyParams: TypeAlias = Mapping[str, WrittenParam | Param | Settable]
+"""Parameters by name: a `ParamSet`, a table, or plain values."""
+
+
 def _written(name: str, given: WrittenParam | Param | Settable, is_extended: bool) -> WrittenParam:
     """Return a parameter. Of plain values, text and bytes that are not four are extended ones."""
-    if isinstance(given, WrittenParam):
-        return given
-    if isinstance(given, Param):
-        return WrittenParam.of(given)
+    if isinstance(given, WrittenParam | Param):
+        return given if isinstance(given, WrittenParam) else WrittenParam.of(given)
     value = check_ext_value(given) if is_extended else check_value(given)
     is_raw = isinstance(value, bytes) and len(value) == WIRE_SIZE
     is_custom = isinstance(value, bytes | str) and not is_raw
@@ -131,7 +133,7 @@ class ParamSet(ByName[WrittenParam]):
         lacks: what is missing of an incomplete table, in words; "" if nothing is known to be.
 
     Raises:
-        UsageError: a plain value, or its name, is not valid.
+        UsageError: a plain value, its name, or an id is not valid.
     """
 
     params: Mapping[str, WrittenParam]
@@ -145,7 +147,7 @@ class ParamSet(ByName[WrittenParam]):
 
     def __init__(
         self,
-        params: Mapping[str, WrittenParam | Param | Settable],
+        params: AnyParams,
         component: int | None = None,
         system: int | None = None,
         identity: Identity | None = None,
@@ -154,6 +156,7 @@ class ParamSet(ByName[WrittenParam]):
         is_extended: bool = False,
         lacks: str = "",
     ) -> None:
+        check_ids(system, component)
         written = {name: _written(name, value, is_extended) for name, value in dict(params).items()}
         given = (written, component, system, identity, at, source, is_extended, lacks)
         for attribute, content in zip(fields(self), given, strict=True):
@@ -180,6 +183,11 @@ class ParamSet(ByName[WrittenParam]):
     def __repr__(self) -> str:
         origin = f" from {self.source}" if self.source else ""
         return f"<ParamSet {counted(len(self.params), 'param')}{origin}>"
+
+
+def set_of(params: AnyParams, *, is_extended: bool = False) -> ParamSet:
+    """Return parameters by name as a set; plain values are extended ones with `is_extended`."""
+    return params if isinstance(params, ParamSet) else ParamSet(params, is_extended=is_extended)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,10 @@ from paramclient.cache import ParamCache
 from paramclient.client.component import Component
 from paramclient.errors import AlreadyRestored, NotInCache, ParamClientError, UnknownVehicle, UsageError
 from paramclient.model.names import age_in_words
-from paramclient.model.paramset import ParamSet, RestorePoint
+from paramclient.model.paramset import ParamSet, RestorePoint, set_of
 from paramclient.provision.apply_rules import OUT_OF_RANGE
 from paramclient.provision.execution import BEFORE_APPLY, BEFORE_RESTORE, ApplyOptions, ApplyResult, run
-from paramclient.provision.inspection import wait_for_identity, wanted_set
+from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.planning import Rows, Wanted
 
 Outcome = TypeVar("Outcome", bound=Rows)
@@ -57,7 +57,8 @@ async def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOpt
         NoReply: the vehicle did not answer before the first write.
         LinkError: the link failed, or the client was closed, before the first write.
     """
-    return await run(component, wanted_set(component, wanted), options, is_restore=False)
+    wanted = set_of(wanted, is_extended=component.is_extended)
+    return await run(component, wanted, options, is_restore=False)
 
 
 async def restore(component: Component, state: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
@@ -77,7 +78,7 @@ async def restore(component: Component, state: Wanted, **options: Unpack[ApplyOp
         UsageError: the state is that of another vehicle, or the vehicle lacks most of its parameters.
         ParamClientError: as from `apply`.
     """
-    state, include = wanted_set(component, state), options.get("include", ())
+    state, include = set_of(state, is_extended=component.is_extended), options.get("include", ())
     given = (include,) if isinstance(include, str) else tuple(include)
     options["include"] = (*await restore_categories(component, state), *given)
     options.setdefault("partial", True)

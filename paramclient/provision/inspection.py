@@ -10,7 +10,7 @@ import anyio
 
 from paramclient.client.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
-from paramclient.model.paramset import ParamSet
+from paramclient.model.paramset import ParamSet, set_of
 from paramclient.model.values import Param, ParamType, Trust
 from paramclient.provision.planning import Plan, PlanOptions, Wanted, plan_from
 from paramclient.provision.sources import component_set, part_set
@@ -43,19 +43,10 @@ async def plan(component: Component, wanted: Wanted, **options: Unpack[PlanOptio
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    wanted = wanted_set(component, wanted)
+    wanted = set_of(wanted, is_extended=component.is_extended)
     plan_for(component, wanted, None, options)
     await wait_for_identity(component)
     return plan_for(component, wanted, await inspect(component, wanted), options)
-
-
-def wanted_set(component: Component, wanted: Wanted) -> ParamSet:
-    """Return wanted parameters as a set for a component.
-
-    Raises:
-        UsageError: a plain value is not valid.
-    """
-    return wanted if isinstance(wanted, ParamSet) else ParamSet(wanted, is_extended=component.is_extended)
 
 
 def plan_for(component: Component, wanted: ParamSet, found: Inspection | None, options: PlanOptions) -> Plan:

@@ -18,7 +18,7 @@ from paramclient.metadata import ParamInfo
 from paramclient.model.comparison import same_value
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
 from paramclient.model.names import is_group_switch, nearest_names
-from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.paramset import ParamSet, WrittenParam, set_of
 from paramclient.model.values import Encoding, Param, ParamType, Settable, Value, format_value
 from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.provision.apply_rules import ACTION, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
@@ -283,8 +283,7 @@ def plan_from(
         UsageError: an element of `include` is neither a category nor a glob; `current` and `wanted` are of
             different components or autopilots, or one has plain and the other extended parameters.
     """
-    if not isinstance(wanted, ParamSet):
-        wanted = ParamSet(wanted, is_extended=isinstance(current, ParamSet) and current.is_extended)
+    wanted = set_of(wanted, is_extended=isinstance(current, ParamSet) and current.is_extended)
     return _Planner(current, wanted, autopilot, encoding, options).plan()
 
 

@@ -94,6 +94,8 @@ def test_inexpressible_content_fails_before_writing(old: Path) -> None:
     path = old.rename(old.with_suffix(".params"))
     error = refused(lambda: write_file(path, PARAMS))
     assert str(error) == f"{path}: B has no type that MAVLink defines, and this format needs one"
+    with pytest.raises(TypeError, match="5 is not a ParamSet"):
+        write_file(path, [5])  # type: ignore[list-item]
     assert path.read_bytes() == OLD
 
 

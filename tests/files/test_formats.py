@@ -493,7 +493,6 @@ CAMERA = params_of(WrittenParam("A", 1, ParamType.INT8), component=100)
         *(
             ([unreadable], form, problem)
             for unreadable, problem in (
-                (params_of(WrittenParam("A", 1), system=256), "component ids 0 to 255, not 256"),
                 (params_of(WrittenParam("", 1)), "at least one character"),
                 (params_of(WrittenParam("A_VERY_LONG_NAME_", 1)), "a param_id holds 16"),
                 (replace(CAMERA, at=math.inf), "inf is not a valid Unix time in seconds"),

@@ -96,23 +96,16 @@ def test_a_comparison_is_complete_and_symmetric(
     assert sum(there.counts.values()) == len(there.entries)
 
 
+def test_plain_values_are_compared_as_sets_are() -> None:
+    assert compare({"A": 5, "B": 1}, {"A": 6, "B": 1}, base={"A": 5}).changed_sides == {ChangedSide.RIGHT: 1}
+
+
 def test_defaults_of_leaves_out_unknown_and_differing_defaults() -> None:
-    old = ParamSet(
-        {
-            "A": WrittenParam("A", 5, INT32, 1),
-            "B": WrittenParam("B", 2.0, REAL32, 2.0),
-            "C": WrittenParam("C", 3.0, REAL32),
-        }
-    )
-    new = ParamSet(
-        {
-            "A": WrittenParam("A", 5, INT32, 1),
-            "B": WrittenParam("B", 3.0, REAL32, 3.0),
-            "D": WrittenParam("D", 1.0, REAL32, 0.0),
-        }
-    )
+    both = WrittenParam("A", 5, INT32, 1)
+    old = ParamSet({"A": both, "B": WrittenParam("B", 2.0, REAL32, 2.0), "C": WrittenParam("C", 3.0, REAL32)})
+    new = ParamSet({"A": both, "B": WrittenParam("B", 3.0, REAL32, 3.0), "D": WrittenParam("D", 1, INT32, 0)})
     base = defaults_of(old, new)
-    assert dict(base) == {"A": WrittenParam("A", 1, INT32), "D": WrittenParam("D", 0.0, REAL32)}
+    assert dict(base) == {"A": WrittenParam("A", 1, INT32), "D": WrittenParam("D", 0, INT32)}
     changed_side = {entry.name: entry.changed_side for entry in compare(old, new, base=base).entries}
     assert changed_side == {"A": ChangedSide.BOTH, "B": None, "C": None, "D": ChangedSide.RIGHT}
     assert len(defaults_of(ParamSet({"A": WrittenParam("A", 1)}))) == 0

@@ -29,6 +29,8 @@ def test_plain_values_have_names_that_a_parameter_can_have() -> None:
     for each in wrong:
         with pytest.raises((UsageError, TypeError), match=r"parameter name|not iterable"):
             ParamSet(each)
+    with pytest.raises(UsageError, match="component ids 0 to 255, not 300"):
+        ParamSet({}, component=300)
 
 
 @pytest.mark.parametrize(
