@@ -306,13 +306,13 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
         return answers[0]
     if session.channel.is_lost or has_gap is not False:
         return None
-    sent = f": its list has {len(session.table.names)} of {session.table.count} parameters"
-    raise _unknown(session, which, sent * (not session.table.is_complete))
+    sent = f" (its list has {len(session.table.names)} of {session.table.count} parameters)"
+    raise _unknown(session, which, sent=sent * (not session.table.is_complete))
 
 
-def _unknown(session: Session, which: str | int, reason: str = "") -> UnknownParameter:
+def _unknown(session: Session, which: str | int, reason: str = "", sent: str = "") -> UnknownParameter:
     name, index = (which, None) if isinstance(which, str) else (None, which)
     nearest = () if name is None else nearest_names(name, session.table.params)
     what = f"{session.channel} has no {'' if name else 'parameter with index '}{which}"
-    what += did_you_mean(nearest) or reason
+    what += (did_you_mean(nearest) or reason) + sent
     return UnknownParameter(what, *session.channel.target, name=name, index=index, nearest=nearest)

@@ -218,8 +218,9 @@ async def test_a_name_that_an_ardupilot_does_not_list_is_unknown(first: int, cou
 async def test_an_unknown_name_of_a_px4_without_hash_is_unknown(serves: tuple[str, ...], step: int) -> None:
     vehicle = Partial(serves=serves, step=step, heartbeat=PX4, count=lambda index: len(TABLE) + 2)
     async with talking(vehicle) as (_, session):
-        with pytest.raises(errors.UnknownParameter):
-            await read(session, "NOPE")
+        lacks = "" if serves is EVERYTHING else rf" \(its list has {len(TABLE)} of "
+        with pytest.raises(errors.UnknownParameter, match=f"no MODES.*{lacks}"):
+            await read(session, "MODES")
         assert vehicle.number_of(messages.ParamRequestList) == (serves is not EVERYTHING)
         assert anyio.current_time() < 15.0
 
