@@ -100,8 +100,7 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
 
     Parameters that the state does not have are not changed. Identity and calibration are written if the state
     is that of this very vehicle: a snapshot, a backup that has its hardware id (as .json files do), or one
-    whose name has it; or if --vehicle names the hardware id. On a terminal, the changes are shown and must be
-    confirmed. The exit codes are those of apply.
+    whose name has it; or if --vehicle names the hardware id. Confirmation and exit codes are those of apply.
 
     A time without a time zone is in the time zone of this computer, in which times are printed too, with its
     offset: 2026-11-20T14:00:00.000+01:00. A time in UTC ends with Z: 2026-11-20T13:00Z.
@@ -110,7 +109,8 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
         url: The link.
         when: A time, such as '2h ago' or '2026-11-20 14:00'; the number of a snapshot, from `history VEHICLE
             --snapshots`; or a backup file. Default: the state before the last apply, unless a restore ran
-            since then. With --vehicle all, a time, or a backup file with {uid} or {system} in its name.
+            since then; an apply that continues an interrupted one within an hour counts with it as one. With
+            --vehicle all, a time, or a backup file with {uid} or {system} in its name.
     """
     if when is None or not (is_file(when) or is_pattern_name(when)):
         try:

@@ -23,6 +23,9 @@ Outcome = TypeVar("Outcome", bound=Rows)
 
 OWN_STATE_CATEGORIES: Final = ("identity", "hardware", "calibration", OUT_OF_RANGE)
 """Categories that `restore` includes if the state is the vehicle's own."""
+CONTINUATION_MAX: Final = 3600.0
+"""Seconds after which an `apply` no longer continues one that was interrupted: values may have been set
+otherwise since."""
 
 
 async def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
@@ -57,8 +60,7 @@ async def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOpt
         NoReply: the vehicle did not answer before the first write.
         LinkError: the link failed, or the client was closed, before the first write.
     """
-    wanted = set_of(wanted, is_extended=component.is_extended)
-    return await run(component, wanted, options, is_restore=False)
+    return await run(component, set_of(wanted, is_extended=component.is_extended), options, is_restore=False)
 
 
 async def restore(component: Component, state: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
@@ -114,6 +116,8 @@ def load_restore_point(
 ) -> RestorePoint:
     """Return the state that the cache stored before the latest `apply`, and what happened after it.
 
+    An `apply` that was interrupted, and the one that follows it within `CONTINUATION_MAX`, count as one.
+
     A restore stores a snapshot before its first write. If there is one after the `apply`, even of a restore
     that did not end, the state must be named: another restore would also undo later changes.
 
@@ -137,6 +141,10 @@ def load_restore_point(
         point = next((each for each in snapshots[::-1] if each.reason == BEFORE_APPLY), None)
         if point is None:
             raise missing
+        for each in [each for each in snapshots[::-1] if each.id < point.id and each.ended is not None]:
+            if (each.reason, each.ended) != (BEFORE_APPLY, False) or point.at - each.at > CONTINUATION_MAX:
+                break
+            point = each
         restores = [each for each in snapshots if each.reason == BEFORE_RESTORE and each.id > point.id]
         if restores:
             restored, applied = (age_in_words(time.time() - each.at) for each in (restores[-1], point))

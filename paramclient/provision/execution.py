@@ -281,8 +281,7 @@ class _Run:
             await self.component.core.cache_writer.write_durably(self.component.node)
         number, cache = self._snapshot, self.component.core.cache
         if cache is not None and number is not None:
-            with suppress(CacheError):  # the warning of the cache writer says so
-                await self.component.core.cache_writer.run_in_thread(lambda: cache.end_operation(number))
+            await self.component.core.cache_writer.attempt(partial(cache.end_operation, number))
 
     def result(self, error: ParamClientError | None, elapsed: float) -> ApplyResult:
         """Return the result of the run."""

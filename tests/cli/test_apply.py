@@ -448,10 +448,11 @@ def test_ctrl_c_before_the_first_outcome_says_whether_something_was_sent(
     assert not as_json or (outcome.json["complete"], outcome.json["params"]) == (False, {})
 
 
-def test_an_interrupted_restore_is_continued_by_its_number(command: Command, put: Put, file: File) -> None:
+def test_an_interrupted_apply_or_restore_is_continued(command: Command, put: Put, file: File) -> None:
     names = [f"P{number:02}" for number in range(40)]
     wanted = file("".join(f"{name},2\n" for name in names))
-    assert command("apply", put(GenericVehicle(dict.fromkeys(names, 1))), wanted).code == 0
+    url = put(Interrupting(dict.fromkeys(names, 1)))
+    assert [command("apply", url, wanted).code for _ in range(2)] == [130, 0]
     vehicle = Interrupting(dict.fromkeys(names, 2))
     outcome = command("restore", put(vehicle))
     next_command = "to continue: paramclient restore udpin:0.0.0.0:14550 1 --vehicle 1/1\n"
@@ -475,8 +476,7 @@ def test_metadata_gives_ranges_and_reboots(command: Command, put: Put, file: Fil
     assert outcome.code == 2
     assert "RTL_ALT: 2500 is above the maximum of 2000" in outcome.err
     assert vehicle.requests["PARAM_SET"] == 0
-    options = ("--metadata", metadata, "--include", "out-of-range")
-    outcome = command("apply", put(vehicle), file(), *options)
+    outcome = command("apply", put(vehicle), file(), "--metadata", metadata, "--include", "out-of-range")
     assert outcome.code == 0
     assert "takes effect after a reboot: WPNAV_SPEED" in outcome.err
 

@@ -20,9 +20,10 @@ from paramclient.model.paramset import ParamSet
 from paramclient.model.values import ParamType
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.provision import MISSING, ApplyProgress, ApplyResult, ApplyStatus, apply, plan, restore
-from paramclient.provision.apply_restore import restore_categories
+from paramclient.provision.apply_restore import load_restore_point, restore_categories
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
 from paramclient.wire import frames, messages
+from tests.caches import PX4
 from tests.shell import FlakyLink, Tap, a_client, clamped, in_simulated_time, residue
 
 Table: TypeAlias = dict[str, Any]
@@ -269,6 +270,13 @@ async def test_a_simulator_has_the_hardware_id_of_its_state_on_another_link() ->
         await apply(component, {})  # identifies it
         state = ParamSet({}, identity=replace(component.identity, link="udpin:0.0.0.0:14559"))
         assert "calibration" in await restore_categories(component, state)
+
+
+def test_an_apply_continues_only_a_recent_one(tmp_path: Path) -> None:
+    with ParamCache(tmp_path / "cache") as cache:
+        for at in (1e9, 1.1e9, 1.1e9 + 100):
+            cache.store_snapshot(PX4, 1, ParamSet({}), reason="before apply", at=at, is_of_operation=True)
+        assert load_restore_point(cache, PX4.key, 1).snapshot == 2
 
 
 async def test_a_vehicle_armed_during_the_run_ends_it() -> None:
