@@ -307,6 +307,7 @@ CASES = {
     "silent": ("stream", "MAVFTP did not answer"),
     "denied": ("stream", "computes no checksum"),
     "announced": ("ftp", "another number"),
+    "announced later": ("ftp", "another number"),
     "count": ("ftp", "other parameters"),
     "many": ("ftp", "quicker than a search"),
     "renamed": ("ftp", "other parameters"),
@@ -318,7 +319,7 @@ CASES = {
 async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None:
     vehicle = ArduPilotVehicle(ftp=kind != "denied")
     cached = vehicle.params
-    if kind in ("count", "announced"):
+    if kind in ("count", "announced", "announced later"):
         vehicle.load({"EK2_ENABLE": 1})
     elif kind == "many":
         vehicle.load(dict.fromkeys(list(cached)[300:700:20], 3))
@@ -340,16 +341,20 @@ async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None
         conversation.hear(FileTransfer(0, 255, 190, refusal.pack()))
         return False
 
+    announcement = ParamValue("STAT_RUNTIME", bytes(4), ParamType.INT32, 1434, NO_INDEX)
     async with converse(Tap(vehicle, up=passes)) as conversation:
         if kind == "announced":
             await conversation.node()
-            conversation.hear(ParamValue("STAT_RUNTIME", bytes(4), ParamType.INT32, 1434, NO_INDEX))
+            conversation.hear(announcement)
         node = await with_cached_table(conversation, cached)
+        if kind == "announced later":
+            conversation.hear(announcement)
         began = anyio.current_time()
         result = await fetched(vehicle, node)
         source, reason = CASES[kind]
         assert result.source == source
         assert reason in " ".join(result.notes)
+        assert ("EK2_ENABLE" in result.changed) == (kind in ("count", "announced later"))
         assert anyio.current_time() - began < 3.0
 
 
