@@ -121,11 +121,10 @@ class Gateway:
         if bears_key(seen.data) or (table is None and self.copies.is_copy(seen.data, (link, peer))):
             return
         for station in self.stations:
-            if table is not None and self._serves(station, table, link):
-                station.withhold(seen)
+            is_withheld = table is not None and self._serves(station, table, link)
+            station.relay(seen, is_withheld=is_withheld)
+            if table is not None and is_withheld:
                 table.take_over(station)
-            else:
-                station.relay(seen)
 
     def announce(self, link: VehicleLink, table: KeptTable, message: Message) -> None:
         """Send a value that has changed to all stations."""

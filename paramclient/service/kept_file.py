@@ -29,6 +29,8 @@ OPEN_FILES_MAX: Final = 64
 
 SessionKey: TypeAlias = tuple[Hashable, ...]
 """What names a session of a station: what answers it, the ids of the sender, and the number."""
+Route: TypeAlias = Callable[[], None]
+"""Passes a request to the vehicle."""
 
 
 class FileQuery(NamedTuple):
@@ -75,10 +77,9 @@ def rows_of(session: Session) -> Rows | None:
     for param in params:
         if param.is_raw or param.type not in PACKABLE or param.trust is Trust.CACHED:
             return None
-        default = None
-        if param.default is not None and param.is_changed:
-            default = bits_of(param.default, param.type)
-        entries.append(PackedParam(param.name, ParamType(param.type), param.bits, default))
+        name, kind, bits, default = param.name, ParamType(param.type), param.bits, param.default
+        own = None if default is None or not param.is_changed else bits_of(default, kind)
+        entries.append(PackedParam(name, kind, bits, own))
     if table.hash is None and any(may_be_rounded(row) for row in entries):
         return None
     return Rows(entries, all(each.default is not None for each in params))
@@ -128,7 +129,7 @@ class KeptFile:
         self._rows_at = lru_cache(1)(lambda state: rows_of(table.session))
         self._opening = Pending[tuple[Asker, Packet]]()
 
-    def take(self, asker: Asker, payload: bytes, route: Callable[[], None]) -> bool:
+    def take(self, asker: Asker, payload: bytes, route: Route) -> bool:
         """Answer a request; return False for one that the vehicle has to answer.
 
         Args:
@@ -165,7 +166,7 @@ class KeptFile:
         if len(files) > OPEN_FILES_MAX:
             del files[next(iter(files))]
 
-    def _begin(self, asker: Asker, request: Packet, key: SessionKey, route: Callable[[], None]) -> bool:
+    def _begin(self, asker: Asker, request: Packet, key: SessionKey, route: Route) -> bool:
         """Open the file, or answer its checksum; wait for a fetch that may bring the table."""
         query, file = FileQuery.of(request), asker.station.files.get(key)
         is_checksum = request.opcode == Opcode.CALC_FILE_CRC32
@@ -192,9 +193,7 @@ class KeptFile:
         self._say(asker, _opened(request, rows))
         return True
 
-    async def _begin_later(
-        self, asker: Asker, request: Packet, key: SessionKey, route: Callable[[], None]
-    ) -> None:
+    async def _begin_later(self, asker: Asker, request: Packet, key: SessionKey, route: Route) -> None:
         try:
             with anyio.move_on_after(FILE_WAIT):
                 await self._table.load().wait()

@@ -520,8 +520,6 @@ async def metrics(hub: HubArgument) -> PlainTextResponse:
 def _metrics(hub: Hub) -> Iterator[tuple[str, Sequence[tuple[Mapping[str, object], float]]]]:
     """Yield the name of each metric, with labels and values. The name of a counter ends with `_total`."""
     yield "info", [({"version": __version__}, 1)]
-    yield "uptime_seconds", [({}, time.monotonic() - hub.started)]
-    yield "events_total", [({}, hub.feed.seq)]
 
     links = [({"link": link.name}, link) for link in hub.links.values()]
     yield "link_open", [(at, link.state == "open") for at, link in links]

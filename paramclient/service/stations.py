@@ -31,6 +31,9 @@ DATAGRAM_INTERVAL: Final = 0.002
 buffer holds 256 of them (measured)."""
 STATION_QUEUE_MAX: Final = 4_000
 """Frames that wait for a station, at most: two seconds of a busy link. Further ones are dropped."""
+QUEUE_TIME: Final = 2.0
+"""Seconds for which a vehicle's frame waits if a newer message of its kind does too: a slow link cannot carry
+all, and answers wait behind them."""
 STREAMS_PER_STATION_MAX: Final = 256
 """Lists and files in progress for one station, at most: one of each vehicle."""
 STATION_TIMEOUT: Final = 60.0
@@ -131,7 +134,7 @@ class GroundStation:
         self.writing = anyio.CapacityLimiter(SETS_AT_ONCE)
         self.relayed = self.answered = self.dropped = self.saved = 0
         self._numbering: defaultdict[Source, Numbering] = defaultdict(Numbering)
-        self._queue: deque[tuple[Source, bytes | Message | None, bool]] = deque()  # None: withheld
+        self._queue: deque[tuple[float, Source, bytes | Message | None, bool]] = deque()  # None: withheld
         self._streams: dict[Hashable, tuple[Source, Iterator[Message]]] = {}
         self._is_turn_of_streams = False
         self._held: bytes | None = None  # numbered, but too long for the last datagram
@@ -169,13 +172,9 @@ class GroundStation:
         if len(self.sources) < SOURCES_MAX:
             self.sources.add((seen.frame.system, seen.frame.component))
 
-    def relay(self, seen: SeenFrame) -> None:
-        """Queue a frame of a vehicle."""
-        self._put((seen.frame.system, seen.frame.component), seen.data)
-
-    def withhold(self, seen: SeenFrame) -> None:
-        """Leave a frame of a vehicle out, so that it does not count as lost."""
-        self._put((seen.frame.system, seen.frame.component), None)
+    def relay(self, seen: SeenFrame, *, is_withheld: bool) -> None:
+        """Queue a frame of a vehicle; a withheld one is left out, and does not count as lost."""
+        self._put((seen.frame.system, seen.frame.component), None if is_withheld else seen.data)
 
     def say(self, message: Message, source: Source, *, is_answer: bool = True) -> None:
         """Queue a message in the name of a component; none that MAVLink 1 lacks for a station of that."""
@@ -221,7 +220,7 @@ class GroundStation:
 
     def _put(self, source: Source, item: bytes | Message | None, is_answer: bool = False) -> None:
         if len(self._queue) < STATION_QUEUE_MAX:
-            self._queue.append((source, item, is_answer))
+            self._queue.append((anyio.current_time(), source, item, is_answer))
             self._something_to_send.set()
         else:
             self.dropped += 1
@@ -234,12 +233,14 @@ class GroundStation:
 
     def _next_of_queue(self) -> bytes | None:
         while self._queue:
-            source, item, is_answer = self._queue.popleft()
+            queued_at, source, item, is_answer = self._queue.popleft()
             numbering = self._numbering[source]
             if item is None:
                 numbering.withhold()
             elif not isinstance(item, bytes):
                 return self._inserted(source, item, is_answer)
+            elif anyio.current_time() - queued_at > QUEUE_TIME and self._has_newer(source, item):
+                self.dropped += 1
             else:
                 self.relayed += 1
                 is_version_2 = item[0] == 0xFD
@@ -247,6 +248,12 @@ class GroundStation:
                     return item  # signed: renumbered, it would be rejected
                 return renumber_frame(unsign_frame(item), numbering.relay(item[4 if is_version_2 else 2]))
         return None
+
+    def _has_newer(self, source: Source, item: bytes) -> bool:
+        """Return whether a message of the kind of a frame waits behind it."""
+        kind = slice(7, 10) if item[0] == 0xFD else slice(5, 6)  # the message id
+        frames = (each for _, other, each, _ in self._queue if other == source and isinstance(each, bytes))
+        return any(each[kind] == item[kind] for each in frames)
 
     def _next_of_streams(self) -> bytes | None:
         for key, (source, messages) in list(self._streams.items()):

@@ -136,6 +136,11 @@ async def test_rule_1_stations_with_equal_ids_send_equal_frames() -> None:
             assert len(each.of(ParamValue)) == 26
             assert len(each.of(messages.ParamError)) == 1
         assert len(vehicle.messages(messages.CommandLong)) == 1  # the others are equal, and arrive at once
+        for _ in range(2):
+            same = messages.encode(messages.CommandLong(1, 1, 401), system=255, component=190, sequence=0)
+            station.send_bytes(same)
+            await anyio.sleep(0.5)
+        assert len(vehicle.messages(messages.CommandLong)) == 3
 
 
 async def test_rule_1_a_list_at_the_first_heartbeat_stays_off_the_radio() -> None:
@@ -288,7 +293,7 @@ def content_of(packets: list[Packet]) -> bytes:
     return b"".join(each.data for each in pieces)
 
 
-@pytest.mark.parametrize("size", [239, 110, 80])
+@pytest.mark.parametrize("size", [255, 110, 80])
 @pytest.mark.parametrize("query", ["", "?withdefaults=1", "?start=100&count=50"])
 async def test_rule_2_the_parameter_file_in_the_requested_pieces(size: int, query: str) -> None:
     path = f"@PARAM/param.pck{query}"
@@ -296,6 +301,7 @@ async def test_rule_2_the_parameter_file_in_the_requested_pieces(size: int, quer
         [opened] = await station.ask_file(Opcode.OPEN_FILE_RO, data=path.encode(), session=3, sequence=5)
         assert (opened.opcode, opened.session, opened.sequence) == (Opcode.ACK, 3, 6)
         content = content_of(await station.ask_file(Opcode.BURST_READ_FILE, size=size, session=3))
+        size = min(size, 239)  # what fits in a message
         assert max(map(len, station.datagrams)) <= 1_400
         pack = decode(direct_file(path, size))
         rows = [each._replace(default=None) if each.default == each.bits else each for each in pack.entries]
@@ -411,14 +417,16 @@ async def test_rule_3_a_list_that_is_asked_during_the_fetch_streams_it() -> None
         await served.clients[0].component()
         stations = [served.partner(system=number) for number in range(250, 254)]
         began = anyio.current_time()
-        for each in stations:
-            each.send(LIST, LIST)
+        for _ in range(2):
+            for each in stations:
+                each.send(LIST)
+            await anyio.sleep(1.0)
         component = await served.clients[0].component()
         await until(lambda: component.sync_state == "synced")
         await anyio.sleep(1.0)
         for each in stations:
             indices = [value.param_index for value in each.of(ParamValue) if value.param_id != "_HASH_CHECK"]
-            assert sorted(set(indices)) == list(range(component.count or 0))
+            assert sorted(indices) == list(range(component.count or 0))
             assert first_value_at(each) - began <= 2.0
         assert len(vehicle.messages(ParamRequestList)) <= 5  # of the gateway alone
         assert askers(vehicle) == {254}
@@ -809,7 +817,9 @@ async def test_rule_6_stations_are_bounded_and_silent_ones_forgotten(monkeypatch
         assert [each.sources for each in served.gateway.stations] == [{(9, 190)}]
 
 
-async def test_rule_6_telemetry_holds_no_list_up() -> None:
+@pytest.mark.parametrize("seconds", [1.0, 3.0])
+async def test_rule_6_telemetry_holds_no_list_up(seconds: float) -> None:
+    """Of a message that has waited for 2 s, the newest is sent: a slow link carries no others."""
     vehicle = Puppet(lambda message: ())
     async with in_sync(Air([small_px4(), vehicle])) as (served, _, station):
         await station.ask(GCS)
@@ -817,11 +827,13 @@ async def test_rule_6_telemetry_holds_no_list_up() -> None:
         served.link.is_stuck = True
         for _ in range(2_000):
             vehicle.say_bytes(frame)
-        await anyio.sleep(2.0)
+        vehicle.say_bytes(frames.build_frame(74, bytes(20), system=1, component=1, sequence=2))
+        await anyio.sleep(seconds)
         served.link.is_stuck = False
         await station.ask(LIST, seconds=1.0)
         ids = [each.message_id for each in station.frames]
-        assert ids.index(22) < 200 < ids.count(30)
+        assert ids.index(22) < 200
+        assert (ids.count(30) > 200, ids.count(74)) == (seconds < 2, 1)
 
 
 # 7: sequence numbers
@@ -927,12 +939,13 @@ async def test_rule_9_the_gateway_has_the_id_of_no_station() -> None:
     """Otherwise it would take their answers for its own."""
     async with in_sync(ArduPilotVehicle(), system=255, component=1) as (served, vehicle, _):
         station = served.partner(system=254, component=191)
+        await served.partner(system=253).ask(GCS)
         await station.ask(GCS, seconds=2.0)
         vehicle.received.clear()
         [answer] = await station.ask_file(Opcode.OPEN_FILE_RO, data=b"nothing.txt")
         assert answer.opcode == Opcode.NAK
         await anyio.sleep(2.0)
-        assert {frame.system for _, frame, _ in vehicle.received} == {253, 254}
+        assert {frame.system for _, frame, _ in vehicle.received} == {252, 254}
 
 
 # 10: all components, and two vehicles with one id
@@ -1101,7 +1114,6 @@ def test_rule_13_names_of_endpoints(tmp_path: Path) -> None:
     assert parse_endpoint("tcpin:5760").name == "tcpin:127.0.0.1:5760"
     assert parse_endpoint("udpin:0.0.0.0:14551?readonly&trusted").is_trusted
     signed = parse_endpoint(f"udpout:127.0.0.1:14550?sign={key}&trusted")
-    assert signed.name == "udpout:127.0.0.1:14550"
     assert signed.signer is not None
     assert not signed.is_trusted  # its frames keep their signatures
     with pytest.raises(UsageError, match="no endpoint"):
@@ -1266,6 +1278,13 @@ async def test_a_station_that_floods_and_one_that_sends_garbage() -> None:
         assert not vehicle.messages(messages.CommandLong)
         assert max(len(each.files) for each in served.gateway.stations) == kept_file.OPEN_FILES_MAX
         assert station.of(messages.Heartbeat)
+
+
+async def test_the_reads_of_a_station_hold_no_other_up() -> None:
+    async with in_sync(Air.symmetric([PX4Vehicle()], delay=0.02)) as (served, _, station):
+        served.partner(system=7).send(*(ParamRequestRead(1, 1, f"N{number}", -1) for number in range(200)))
+        await station.ask(ParamRequestRead(1, 1, "UNKNOWN", -1), seconds=3.0)
+        assert [each.param_id for each in station.of(messages.ParamError)] == ["UNKNOWN"]
 
 
 async def test_noise_is_searched_once_and_little_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
