@@ -25,7 +25,7 @@ from paramclient.cli.json_output import JsonObject, outcome_json, table_param_js
 from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import Event, ParamClient
 from paramclient.client.component import Component
-from paramclient.errors import LinkError, ParamClientError, UsageError
+from paramclient.errors import ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of
 from paramclient.metadata.info import number_of
@@ -472,7 +472,9 @@ class Hub:
                         self._take(link, event, tasks)
                     self._set_state(link, "ended")
                     await anyio.sleep_forever()
-            except (LinkError, UsageError) as error:  # UsageError: a missing library
+            except Exception as error:  # UsageError: a missing library
+                if not isinstance(error, ParamClientError):
+                    logger.exception("%s: an error of the program, which ends no other link", link.name)
                 self._set_state(link, "failed", str(error))
             finally:
                 link.client = None

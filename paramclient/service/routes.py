@@ -528,10 +528,7 @@ def _metrics(hub: Hub) -> Iterator[tuple[str, Sequence[tuple[Mapping[str, object
     yield "link_bytes_sent_total", [(at, each.bytes_sent) for at, each in clients]
 
     tables = [(target.address, target.component) for target in hub.targets]
-    yield "component_up", [(at, each.sync_state != "lost") for at, each in tables]
     yield "component_synced", [(at, each.sync_state == "synced") for at, each in tables]
-    yield "component_parameters", [(at, len(each.params)) for at, each in tables]
-    yield "component_round_trip_seconds", [(at, each.round_trip) for at, each in tables if each.round_trip]
 
     endpoints = [({"endpoint": each.name}, each.stations.values()) for each in hub.gateway.endpoints]
     yield "stations", [(at, len(stations)) for at, stations in endpoints]

@@ -14,7 +14,7 @@ import os
 import re
 import secrets
 import socket
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Mapping
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
@@ -275,14 +275,6 @@ def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
     return app
 
 
-class _Server(uvicorn.Server):
-    """uvicorn without its signal handlers: the command has its own."""
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Generator[None, None, None]:
-        yield
-
-
 def listen_at(address: str, *, is_protected: bool) -> tuple[socket.socket, str]:
     """Return a listening socket and its URL.
 
@@ -347,7 +339,8 @@ async def serve(
         timeout_keep_alive=IDLE_TIMEOUT,
         timeout_graceful_shutdown=SHUTDOWN_TIMEOUT,
     )
-    server = _Server(config)
+    server = uvicorn.Server(config)
+    server.capture_signals = contextlib.nullcontext  # type: ignore[assignment]  # the command has its own
     opened, url = listen_at(address, is_protected=tokens is not None)
     with opened:
         async with task_group() as tasks:

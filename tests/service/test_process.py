@@ -97,9 +97,7 @@ INVALID = ["127.0.0.1", ":80", "::1:80", "[::1]", "host:", "host:x", "host:70000
         *((2, ["sim:px4", "--listen", address], "--tokens") for address in OTHERS),
         *((2, ["sim:px4", "--listen", address], "HOST:PORT") for address in INVALID),
         (2, ["sim:px4", "--tokens", "no-such-file"], "no-such-file"),
-        (2, ["sim:px4", "--cache", "a", "--no-cache"], "exclusive"),
         (2, ["sim:px4", "sim:px4"], "twice"),
-        (2, [], "LINK"),
         (4, ["sim:px4", "--listen", "127.0.0.1:0", "--mavlink", NOT_OURS], NOT_OURS),
     ],
 )
