@@ -339,8 +339,10 @@ class _Copies:
         self._note(hash(data), origin or self)
 
     def has(self, data: bytes, *, but_of: Hashable = None) -> bool:
-        """Return whether these bytes were sent a moment ago, and not by this station."""
-        return self._origin(hash(data), but_of) != but_of
+        """Return whether these bytes were sent a moment ago, by another station that is still there."""
+        origin = self._origin(hash(data), but_of)
+        has_left = isinstance(origin, GroundStation) and origin.scope.cancel_called
+        return origin != but_of and not has_left
 
     def is_copy(self, data: bytes, origin: Hashable) -> bool:
         """Return whether a frame was sent to a station, or came from another origin, a moment ago.

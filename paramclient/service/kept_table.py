@@ -456,6 +456,8 @@ class KeptTable(Stream[Change]):
             await read(session, name)
             if self.is_loading:
                 scope.deadline = anyio.current_time() + SET_TIMEOUT
+        if name not in params:  # it is not stored
+            return ParamErrorCode.DOES_NOT_EXIST
         known = params[name].type
         if number != known and (is_extended or session.table.encoding is not Encoding.C_CAST):
             return ParamErrorCode.TYPE_MISMATCH

@@ -45,7 +45,6 @@ def test_autopilots_are_first_then_usb_devices(monkeypatch: pytest.MonkeyPatch) 
     ("vendor", "product", "manufacturer", "autopilot"),
     [
         (0x26AC, 0x0011, "3D Robotics", "Pixhawk"),
-        (0x1209, 0x5740, "ArduPilot", "ArduPilot"),
         (0x0483, 0x5740, "mRo", "mRo"),
         (0x0483, 0x5740, "STMicroelectronics", None),
     ],

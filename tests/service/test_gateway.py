@@ -141,6 +141,10 @@ async def test_rule_1_stations_with_equal_ids_send_equal_frames() -> None:
             station.send_bytes(same)
             await anyio.sleep(0.5)
         assert len(vehicle.messages(messages.CommandLong)) == 3
+        for each in (station, served.partner()):  # a program that has ended, and one that is started then
+            each.send_bytes(b"" if each is station else same)
+            await anyio.sleep(0.5)
+        assert len(vehicle.messages(messages.CommandLong)) == 4
 
 
 async def test_rule_1_a_list_at_the_first_heartbeat_stays_off_the_radio() -> None:
@@ -696,6 +700,14 @@ async def test_rule_4_an_error_goes_to_the_asker_alone_within_3_seconds() -> Non
         await station.ask(set_to("PARAM_01", 5), seconds=3.0)
         assert station.of(messages.ParamError) == [messages.ParamError(255, 190, "PARAM_01", -1, 4)]
         assert not other.of(messages.ParamError)
+
+
+async def test_rule_4_a_name_that_is_not_stored_is_unknown() -> None:
+    answers = {ParamRequestRead(1, 1, "B,", -1): [ParamValue("B,", bytes(4), ParamType.REAL32, 25, 65535)]}
+    also = Puppet(lambda message: answers.get(message, []), heartbeat=None)
+    async with in_sync(Air([small_px4(), also])) as (_, _, station):
+        await station.ask(set_to("B,", 1, ParamType.REAL32), seconds=3.0)
+        assert [each.error for each in station.of(messages.ParamError)] == [1]
 
 
 async def test_rule_4_an_ardupilot_takes_names_in_any_case_and_values_of_any_type() -> None:
