@@ -477,14 +477,15 @@ class KeptTable(Stream[Change]):
     def _reject(self, askers: Iterable[Asker], key: SetKey, code: int) -> None:
         """Refuse a set, and show the value that stays."""
         name, raw, number, _ = key
+        value = self.known(name)
         if self.session.dialect.has_ack:
             is_value = code in (ExtAckResult.VALUE_UNSUPPORTED, ParamErrorCode.TYPE_MISMATCH)
             result = ExtAckResult.VALUE_UNSUPPORTED if is_value else ExtAckResult.FAILED
+            raw, number = (raw, number) if value is None else (value.raw, value.param_type)
             self._say(askers, messages.ParamExtAck(name, raw, number, result))
             return
         self._refuse(askers, name, code)
-        stays = code in (ParamErrorCode.READ_ONLY, ParamErrorCode.VALUE_OUT_OF_RANGE)
-        if stays and (value := self.known(name)):
+        if value is not None and code in (ParamErrorCode.READ_ONLY, ParamErrorCode.VALUE_OUT_OF_RANGE):
             self._say(askers, value)
 
     def _refuse(self, askers: Iterable[Asker], which: Which, code: int) -> None:

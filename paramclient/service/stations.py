@@ -239,7 +239,7 @@ class GroundStation:
                 numbering.withhold()
             elif not isinstance(item, bytes):
                 return self._inserted(source, item, is_answer)
-            elif anyio.current_time() - queued_at > QUEUE_TIME and self._has_newer(source, item):
+            elif anyio.current_time() - queued_at > QUEUE_TIME and self._has_newer(item):
                 self.dropped += 1
             else:
                 self.relayed += 1
@@ -249,11 +249,10 @@ class GroundStation:
                 return renumber_frame(unsign_frame(item), numbering.relay(item[4 if is_version_2 else 2]))
         return None
 
-    def _has_newer(self, source: Source, item: bytes) -> bool:
+    def _has_newer(self, item: bytes) -> bool:
         """Return whether a message of the kind of a frame waits behind it."""
-        kind = slice(7, 10) if item[0] == 0xFD else slice(5, 6)  # the message id
-        frames = (each for _, other, each, _ in self._queue if other == source and isinstance(each, bytes))
-        return any(each[kind] == item[kind] for each in frames)
+        kind = slice(5, 10) if item[0] == 0xFD else slice(3, 6)  # sender and message id
+        return any(isinstance(each, bytes) and each[kind] == item[kind] for _, _, each, _ in self._queue)
 
     def _next_of_streams(self) -> bytes | None:
         for key, (source, messages) in list(self._streams.items()):

@@ -277,7 +277,8 @@ async def test_rule_2_extended_parameters() -> None:
         [acknowledged] = station.of(messages.ParamExtAck)
         assert acknowledged == messages.ParamExtAck("CAM_NAME", new.raw, ParamType.CUSTOM, 0)
         await station.ask(messages.ParamExtSet(1, 100, "CAM_NAME", bytes(128), ParamType.UINT8))
-        assert [each.param_result for each in station.of(messages.ParamExtAck)] == [1]
+        stays = messages.ParamExtAck("CAM_NAME", new.raw, ParamType.CUSTOM, 1)
+        assert station.of(messages.ParamExtAck) == [stays]
 
 
 def direct_file(path: str, size: int) -> bytes:
@@ -703,8 +704,8 @@ async def test_rule_4_an_error_goes_to_the_asker_alone_within_3_seconds() -> Non
 
 
 async def test_rule_4_a_name_that_is_not_stored_is_unknown() -> None:
-    answers = {ParamRequestRead(1, 1, "B,", -1): [ParamValue("B,", bytes(4), ParamType.REAL32, 25, 65535)]}
-    also = Puppet(lambda message: answers.get(message, []), heartbeat=None)
+    ask, value = ParamRequestRead(1, 1, "B,", -1), ParamValue("B,", bytes(4), ParamType.REAL32, 25, 65535)
+    also = Puppet(lambda message: [value] * (message == ask), heartbeat=None)
     async with in_sync(Air([small_px4(), also])) as (_, _, station):
         await station.ask(set_to("B,", 1, ParamType.REAL32), seconds=3.0)
         assert [each.error for each in station.of(messages.ParamError)] == [1]
