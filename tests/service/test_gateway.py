@@ -461,12 +461,14 @@ async def test_rule_3_stations_during_a_long_fetch() -> None:
         assert len(anyio.get_running_tasks()) <= tasks + stations.REQUESTS_MAX + 20
         [answer] = await station.ask_file(Opcode.OPEN_FILE_RO, data=data, seconds=2.9)
         assert (answer.opcode, answer.code) == (Opcode.NAK, 10)
+        await station.ask_file(Opcode.CALC_FILE_CRC32, data=data[:16], seconds=2.9)
         station.send(LIST)
         for _ in range(10):
             station.send(*(ParamRequestRead(1, 1, "", index) for index in gaps))
             await anyio.sleep(2.0)
         assert len(by_name(station)) == len(by_name(other)) == 1382
-        assert {frame.system for _, frame, _ in vehicle.received} == {254}
+        sent = [frame.payload for _, frame, _ in vehicle.received if frame.system != 254]
+        assert [Packet.unpack(each[3:]).opcode for each in sent] == [Opcode.CALC_FILE_CRC32]
         assert not {each.param_index for each in vehicle.messages(ParamRequestRead)} & {*gaps}
 
 
@@ -1317,6 +1319,7 @@ async def test_noise_is_searched_once_and_little_of_it(monkeypatch: pytest.Monke
 async def test_a_station_that_never_reads(monkeypatch: pytest.MonkeyPatch) -> None:
     """Others are served meanwhile, and its connection is closed."""
     monkeypatch.setattr(sockets, "SEND_TIMEOUT", 0.5)
+    monkeypatch.setattr(sockets, "SILENCE_TIMEOUT", 600.0)
     endpoint = parse_endpoint("tcpin:0")
     async with Hub([PX4Vehicle()], cache=False, mavlink=[endpoint]) as hub:
         await until(lambda: hub.targets and hub.targets[0].component.sync_state == "synced")
