@@ -136,8 +136,8 @@ async def reset(
 
     Fetches the table first. ArduPilot, and PX4 from 1.18 on, give the defaults in the parameter file over
     MAVFTP; defaults that the vehicle does not give are taken from its metadata. The state before is stored,
-    for `restore`. On a terminal, the changes are shown and must be confirmed. If several vehicles are heard,
-    --vehicle must choose one, or all. The exit codes are those of apply; 1 also if a default is not known.
+    for `restore`. If several vehicles are heard, --vehicle must choose one, or all. Confirmation and exit
+    codes are those of apply; 1 also if a default is not known.
 
     Args:
         url: The link.

@@ -132,7 +132,7 @@ CASES: Final = {
         (
             FETCH,
             "diff 1 DATA/json/quad.params --json",
-            "diff DATA/json/quad.params DATA/json/quad.param --json",
+            "diff DATA/json/quad.param DATA/json/quad.params --json",
             "diff DATA/json/quad.params DATA/json/quad.param --base 1 --json",
         ),
     ),
