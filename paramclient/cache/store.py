@@ -81,8 +81,8 @@ class ParamCache:
         else:
             self.path = Path(default_path() if path is None else path).resolve()
             with suppress(OSError):
-                if self.path.exists() and not self.path.is_file():  # opening a pipe would wait for its writer
-                    raise UsageError(f"{self.path} is not a regular file, and no cache")
+                if self.path.exists() and not (self.path.is_file() or self.path.is_dir()):
+                    raise UsageError(f"{self.path} is not a regular file, and no cache")  # a pipe would wait
             with suppress(OSError), self.path.open("rb") as file:
                 if path is not None and file.read(16).strip(b"\0") not in (b"", b"SQLite format 3"):
                     raise UsageError(f"{self.path} is another file, and no cache; it is not touched")
