@@ -72,6 +72,12 @@ class Cable:
         assert readable, "nothing has arrived"
         return os.read(self._file, size)
 
+    def drain(self) -> None:
+        """Read and discard all received bytes."""
+        with suppress(OSError):  # no more bytes, or no program has the port open
+            while os.read(self._file, 65536):
+                pass
+
     async def carry(self, vehicle: Endpoint, *, rate: float, portion: int = 64) -> None:
         """Connect a vehicle to the port, with this many bytes per second each way, until unplugged.
 

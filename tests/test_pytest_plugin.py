@@ -54,8 +54,7 @@ async def session(px4, param_client, param_cache):
         await vehicle.set("MC_ROLL_P", 7.0)
     assert px4.vehicle.values == {"MC_ROLL_P": 7.0, "SYS_AUTOSTART": 4001}
     async with ParamClient(px4) as client:
-        vehicle = await client.component()
-        assert (await vehicle.fetch_all()).source == "cache"
+        assert (await (await client.component()).fetch_all()).source == "cache"
         assert client.cache.path == param_cache.path
     assert len(param_cache.vehicles()) == 1
 

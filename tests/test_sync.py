@@ -103,8 +103,7 @@ def test_open_and_close() -> None:
     assert client.open() is client
     with pytest.raises(errors.UsageError, match="only once"):
         client.open()
-    vehicle = client.component()
-    assert vehicle.get(NAME).value == 4.0
+    assert client.component().get(NAME).value == 4.0
     client.close()
     client.close()
     with pytest.raises(errors.ClientClosed):

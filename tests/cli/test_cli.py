@@ -274,8 +274,7 @@ def test_a_link_that_fails_during_watch_is_reported_once(command: Command, put: 
     def fail() -> None:
         raise LinkError("it is gone", link=URL)
 
-    url = put(Eventful(PX4Vehicle(table={"A": 1}), (9.0, fail)))
-    watched = command("watch", url, "A", "--no-cache")
+    watched = command("watch", put(Eventful(PX4Vehicle(table={"A": 1}), (9.0, fail))), "A", "--no-cache")
     assert (watched.code, watched.out) == (4, "")
     assert watched.err == "watching A of 1/1 px4\nparamclient: it is gone\n"
 
@@ -339,8 +338,7 @@ def test_a_silent_link_is_exit_code_3(live_command: Command, words: str, awaited
 def test_a_failed_link_is_exit_code_4(live_command: Command, put: Put) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
-        outcome = live_command("fetch", f"tcp:127.0.0.1:{port}", "--no-cache")
+        outcome = live_command("fetch", f"tcp:127.0.0.1:{taken.getsockname()[1]}", "--no-cache")
     assert (outcome.code, outcome.out) == (4, "")
     assert "connection refused" in outcome.err
     assert outcome.err.count("\n") == 1

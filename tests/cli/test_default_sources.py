@@ -36,8 +36,7 @@ def test_fetch_compares_with_the_metadata_of_the_vehicle(command: Command, put: 
 
 def test_without_changed_nothing_is_requested_for_defaults(command: Command, put: Put) -> None:
     tap = Tap(quad())
-    done = command("fetch", put(tap), "--json")
-    assert "default" not in done.json["params"]["MC_ROLL_P"]
+    assert "default" not in command("fetch", put(tap), "--json").json["params"]["MC_ROLL_P"]
     assert not tap.messages(messages.FileTransfer)
 
 
@@ -59,8 +58,7 @@ def test_a_cached_table_is_compared_with_the_remembered_metadata(command: Comman
     assert shown.code == 0, shown.err
     assert [row[:3] for row in shown.rows[1:]] == [["MC_ROLL_P", "6.25", "4.0"]]
     assert "1 of 1 default from the metadata" in shown.err
-    reported = command("info", "MC_ROLL_P")
-    assert reported.rows[-1][3:5] == ["4.0", "metadata"]
+    assert command("info", "MC_ROLL_P").rows[-1][3:5] == ["4.0", "metadata"]
     (vehicle,) = command("info", "MC_ROLL_P", "--json").json["vehicles"]
     assert (vehicle["param"]["default_source"], vehicle["param"]["is_default"]) == ("metadata", False)
 

@@ -39,15 +39,8 @@ def keep(cache: Path, content: Content, identity: Identity = FIRST, *, component
     ]
     state = TableState(None, len(params), complete=True, synced_at=NOW)
     with ParamCache(cache) as kept:
-        kept.save(
-            update(
-                *(StoredParam.of(each, NOW) for each in params),
-                identity=identity,
-                component=component,
-                replace=True,
-                table=state,
-            )
-        )
+        stored = [StoredParam.of(each, NOW) for each in params]
+        kept.save(update(*stored, identity=identity, component=component, replace=True, table=state))
 
 
 BEFORE: Content = {

@@ -56,8 +56,7 @@ def test_refusals_have_a_status_and_an_exit_code(command: Command, put: Put) -> 
         ["C", "9", "5", "adjusted"],
     ]
     assert done.rows[1][3] == "1/100 refused A: value unsupported"
-    document = command("set", url, *CAMERA, "A", 2, "--json").json
-    assert document["results"][0]["status"] == "refused"
+    assert command("set", url, *CAMERA, "A", 2, "--json").json["results"][0]["status"] == "refused"
     for words, why in (
         (("A", "text"), "A: 'text' is not a value of type INT32"),
         (("A", "hex:0g"), "is not a value of type INT32"),

@@ -81,8 +81,7 @@ def test_nothing_is_sent_with_a_wrong_name(command: Command, put: Put, words: li
 
 def test_downloaded_metadata_is_stored(command: Command, put: Put) -> None:
     """The stored metadata is used for its firmware without a request, also without a link."""
-    plain = command("get", put(quad()), "MC_ROLL_P", "--json")
-    assert "units" not in plain.out
+    assert "units" not in command("get", put(quad()), "MC_ROLL_P", "--json").out
     assert "1/s" in command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle").out
     vehicle = quad()
     assert "1/s" in command("get", put(vehicle), "MC_ROLL_P").out
@@ -90,8 +89,7 @@ def test_downloaded_metadata_is_stored(command: Command, put: Put) -> None:
     assert "units" not in command("get", put(copter(system=2)), "TST_LOG").out
     done = command("set", put(quad()), "MC_ROLL_P", 13)
     assert "above the maximum of 12" in done.err
-    done = command("show", "1", "MC_ROLL_P")
-    assert "Gain from the error of the roll angle" in done.out
+    assert "Gain from the error of the roll angle" in command("show", "1", "MC_ROLL_P").out
 
 
 def test_the_vehicle_must_confirm_stored_value_names(command: Command, put: Put, cache: Path) -> None:
@@ -99,8 +97,7 @@ def test_the_vehicle_must_confirm_stored_value_names(command: Command, put: Put,
     assert command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle").code == 0
     assert MetadataStore.beside(cache).has_notes
     silent = quad(metadata=False)
-    done = command("set", put(silent), "COM_FLTMODE1=Return")
-    assert done.code == 2
+    assert command("set", put(silent), "COM_FLTMODE1=Return").code == 2
     assert not silent.requests["PARAM_SET"]
     vehicle = quad()
     assert command("set", put(vehicle), "COM_FLTMODE1=Return").code == 0

@@ -41,8 +41,7 @@ CURE = "Check the link towards the vehicle, and whether the vehicle requires sig
 
 @pytest.mark.parametrize("words", [["get", "A"], ["set", "A", 2], ["fetch"]])
 def test_a_vehicle_that_speaks_and_does_not_answer(command: Command, put: Put, words: list[Any]) -> None:
-    url = put(Deaf(table={"A": 1}))
-    done = command(words[0], url, *words[1:])
+    done = command(words[0], put(Deaf(table={"A": 1})), *words[1:])
     assert done.code == 3
     assert SPEAKS in done.err, done.err
     assert done.err.endswith(f"{CURE}\n")
@@ -106,8 +105,7 @@ def test_a_terminal_shows_what_is_awaited(
         *((words, "waiting for A of 1/1 px4 (0 s).") for words in (["get", "A"], ["set", "A", 2])),
         (["fetch"], "fetching 1/1 px4: waiting for the first response (0 s)."),
     ):
-        done = command(words[0], put(Deaf(table={"A": 1})), *words[1:])
-        assert drawn(done.err)[0] == shown
+        assert drawn(command(words[0], put(Deaf(table={"A": 1})), *words[1:]).err)[0] == shown
 
 
 def test_a_quick_response_leaves_the_terminal_alone(

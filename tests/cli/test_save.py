@@ -141,7 +141,6 @@ def test_a_value_that_is_only_cached_is_not_written(command: Command, put: Put, 
     rows = [SimParam("A", ParamType.INT32, 1), SimParam("CAL_ACC0_XOFF", ParamType.INT32, 2, volatile=True)]
     assert command("save", put(PX4Vehicle(table=rows)), path).code == 0
     path.unlink()
-    silent = PX4Vehicle(table=rows, dead=["CAL_ACC0_XOFF"])
-    saved = command("save", put(silent), path)
+    saved = command("save", put(PX4Vehicle(table=rows, dead=["CAL_ACC0_XOFF"])), path)
     assert (saved.code, saved.out, path.exists()) == (1, "", False)
     assert "1/1 px4 on sim:px4 is incomplete: CAL_ACC0_XOFF " in saved.err

@@ -28,8 +28,7 @@ def test_search_finds_names_descriptions_and_value_names(command: Command) -> No
     first = found.json["results"][0]
     assert (first["name"], len(first["vehicles"])) == ("MC_ROLL_P", 1)
     assert "roll" in first["description"].lower()
-    by_name = command("search", "mc_roll_p")
-    assert by_name.rows[1][:3] == ["MC_ROLL_P", "7.5", "1/1"]
+    assert command("search", "mc_roll_p").rows[1][:3] == ["MC_ROLL_P", "7.5", "1/1"]
     assert command("search", "ROLL gain", "--json").json == found.json  # words in quotes
     assert command("search", " ").code == 2
     assert any("EKF2_GPS_CTRL" in row for row in command("search", "heading", "gps").rows)

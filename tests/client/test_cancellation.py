@@ -82,8 +82,7 @@ async def a_session() -> AsyncIterator[tuple[ParamClient, Component]]:
     late.reboot(simulated_time_loop().time(), down=0.03)
     camera = generic(component=100, table=FEW_VALUES, autopilot=messages.MAV_AUTOPILOT_INVALID)
     vehicle = PX4Vehicle(table={**FEW_VALUES, "CAL_ACC0_XOFF": 0.5}, burst=3)
-    air = Air.symmetric([vehicle, camera, late], delay=0.004)
-    async with a_client(air) as client:
+    async with a_client(Air.symmetric([vehicle, camera, late], delay=0.004)) as client:
         yield client, await client.component()
 
 

@@ -168,8 +168,7 @@ async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
 async def test_a_px4_has_fewer_parameters_from_its_second_start_on() -> None:
     async with fetched(PX4Vehicle()) as (_, component):
         before = set(component.params)
-        component = await component.reboot()
-        result = await component.fetch_all()
+        result = await (await component.reboot()).fetch_all()
         assert before - set(result.params) == {"CAL_BARO1_ID", "CAL_BARO2_ID", "CAL_BARO3_ID"}
         assert (result.complete, result.count) == (True, len(before) - 3)
 
@@ -267,8 +266,7 @@ async def test_several_vehicles_are_fetched_side_by_side() -> None:
         for address, result in everything.results.items():
             assert bits(result.params) == bits(vehicles[address].params)
             assert client.components[address].params == result.params
-        one_system = await client.fetch_all(1, refresh=True)
-        assert one_system.results.keys() == {(1, 1), (1, 100)}
+        assert (await client.fetch_all(1, refresh=True)).results.keys() == {(1, 1), (1, 100)}
         await client.components[3, 1].set("RTL_ALT", 1234)
         assert [each.requests["PARAM_SET"] for each in vehicles.values()] == [0, 0, 0, 1]
         assert vehicles[3, 1].param("RTL_ALT").value == 1234
@@ -384,8 +382,7 @@ async def test_calls_go_on_when_the_link_is_back() -> None:
         link.is_offline = False
         assert (await read).value == 20
         assert (await write).status == "accepted"
-        result = await fetch
-        assert result.complete
+        assert (await fetch).complete
         assert bits(component.params) == bits(vehicle.params)
         assert (await anext(changes)).name == "PARAM_00"
         assert "open" in repr(client)

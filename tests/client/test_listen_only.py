@@ -63,8 +63,7 @@ async def test_the_list_that_another_station_requests_fills_the_table() -> None:
             again = await component.fetch_all()
         assert again.params == result.params
         assert again.hash == vehicle.announced_hash()
-        everyone = await client.fetch_all()
-        assert everyone.results[1, 1].hash == vehicle.announced_hash()
+        assert (await client.fetch_all()).results[1, 1].hash == vehicle.announced_hash()
     assert channel.received == []
 
 

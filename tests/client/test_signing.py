@@ -106,8 +106,7 @@ async def test_a_clock_that_was_set_back_adopts_the_vehicles_timestamp(
     for now in (NOW, NOW - 50 * UNITS_PER_SECOND):
         monkeypatch.setattr(signing, "timestamp_now", lambda now=now: now)
         async with a_client(vehicle) as client:
-            component = await client.component()
-            assert (await component.get("PARAM_04", timeout=2.0)).name == "PARAM_04"
+            assert (await (await client.component()).get("PARAM_04", timeout=2.0)).name == "PARAM_04"
 
 
 # Clients
@@ -153,8 +152,7 @@ async def test_a_vehicle_of_mavlink_1_is_given_no_key_and_is_answered_unsigned()
         with pytest.raises(UsageError, match="1/1 uses MAVLink 1"):
             await (await client.component()).setup_signing(KEY, link_is_safe=True)
     async with a_client(vehicle, signing=Signing(KEY, SigningPolicy.ACCEPT_ALL)) as client:
-        component = await client.component()
-        assert (await component.fetch_all()).complete
+        assert (await (await client.component()).fetch_all()).complete
         report = client.signing_report()
         assert report is not None
         assert (report.signed, report.unsigned > 20) == (0, True)

@@ -383,8 +383,7 @@ async def test_nothing_is_checked_or_changed_by_a_refresh_or_without_a_complete_
     for table, refresh in (({}, False), (cached, False), (vehicle.params, True)):
         async with converse(vehicle) as conversation:
             node = await with_cached_table(conversation, table, count=len(table) and len(vehicle.params))
-            result = await fetch_all(node.plain, refresh=refresh)
-            assert result.source == "ftp"
+            assert (await fetch_all(node.plain, refresh=refresh)).source == "ftp"
             assert Opcode.CALC_FILE_CRC32 not in opcodes(conversation)
 
 

@@ -140,8 +140,7 @@ async def test_the_refusal_of_another_stations_set_is_not_taken_for_ours() -> No
 
 
 async def test_a_component_may_have_both_kinds_or_none() -> None:
-    camera = Camera({"A": "text"}, plain={"A": 5})
-    async with converse(Air([camera, PX4Vehicle()])) as conversation:
+    async with converse(Air([Camera({"A": "text"}, plain={"A": 5}), PX4Vehicle()])) as conversation:
         node = await conversation.node(*CAMERA)
         await fetch_all(node.plain)
         await fetch_all(node.extended)

@@ -215,8 +215,7 @@ async def test_a_file_that_is_not_valid_leads_to_the_list_and_drops_nothing(cont
 
 @pytest.mark.parametrize("is_cached", [False, True])
 async def test_a_fetch_does_not_wait_for_another_file(is_cached: bool) -> None:
-    vehicle = ArduPilotVehicle()
-    async with talking(vehicle) as (_, session):
+    async with talking(ArduPilotVehicle()) as (_, session):
         if is_cached:
             await fetch_all(session)
         async with session.channel.ftp:  # as while a log is downloaded
@@ -237,8 +236,7 @@ async def test_integers_of_a_file_are_exact_and_keep_so_beside_rounded_messages(
         assert result.params[name].value == 2**24 + 1
         conversation.hear(ParamValue(name, b"\0\0\x80\x4b", 6, result.count, 65535))  # 2**24 as float32
         assert session.table.params[name].value == 2**24 + 1
-        default = session.table.params[name].default
-        assert isinstance(default, int)
+        assert isinstance(session.table.params[name].default, int)
 
 
 async def test_a_refused_file_is_not_requested_again_on_the_link() -> None:

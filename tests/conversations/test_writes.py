@@ -129,8 +129,7 @@ async def test_a_value_that_does_not_fit_and_an_unknown_name_are_not_sent(make: 
         assert not conversation.sent_of(ParamSet)
         assert not session.writing
         if isinstance(value, float):
-            result = await write(session, name, value, force=True)
-            assert not math.isfinite(float(result.actual))
+            assert not math.isfinite(float((await write(session, name, value, force=True)).actual))
 
 
 NUMBER = {"A": (5, ParamType.INT32)}

@@ -134,8 +134,7 @@ def test_a_comment_never_becomes_a_parameter(form: FileFormat) -> None:
         WrittenParam("A", 1, ParamType.INT8, comment="x\nB,2\r\nB 2\rB,2\x0bB,2\u2028B,2\x00\x1b[31m")
     )
     around = ParamFile((params,), form, "", ("a\rB,2",), ("z\nB 2\udc80",))
-    file = loads(dumps(around), file_format=form)
-    assert list(file.sets[0]) == ["A"]
+    assert list(loads(dumps(around), file_format=form).sets[0]) == ["A"]
     assert "\x1b" not in dumps(around).decode()
 
 

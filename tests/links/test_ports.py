@@ -45,6 +45,11 @@ def test_autopilots_are_first_then_usb_devices(monkeypatch: pytest.MonkeyPatch) 
     ("vendor", "product", "manufacturer", "autopilot"),
     [
         (0x26AC, 0x0011, "3D Robotics", "Pixhawk"),
+        (0x26AC, 0x0015, "3D Robotics", None),
+        (0x2DAE, 0x1058, "CubePilot", "CubePilot"),
+        (0x1209, 0x5740, "ArduPilot", "ArduPilot"),
+        (0x1209, 0x0001, "Example Robotics", None),
+        (0x10C4, 0xEA60, "Silicon Labs", None),
         (0x0483, 0x5740, "mRo", "mRo"),
         (0x0483, 0x5740, "STMicroelectronics", None),
     ],

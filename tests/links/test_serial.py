@@ -119,6 +119,10 @@ async def test_a_stalled_device_is_lost(cable: Cable, port: str, monkeypatch: py
         await until(lambda: failures)
         assert str(failures[0]) == str(caught.value)
         assert b"".join(data for _, data in got) == b"still here"
+        cable.drain()
+        await link.open()
+        await link.send(HEARTBEAT, None)
+        assert cable.recv(100_000) == HEARTBEAT
 
 
 # Ports that cannot be opened

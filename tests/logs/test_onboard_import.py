@@ -36,8 +36,7 @@ def hold(cache: ParamCache, param: Param, at: float, key: str = KEY) -> None:
 
 
 def test_values_and_changes_have_the_times_of_the_log(cache: ParamCache, tmp_path: Path) -> None:
-    path = written(tmp_path, dataflash([*COMMON, FIX, *LATER]))
-    anyio.run(import_onboard_log, path, cache)
+    anyio.run(import_onboard_log, written(tmp_path, dataflash([*COMMON, FIX, *LATER])), cache)
     table = cache.component(KEY)
     assert (table.system, table.autopilot, table.complete) == (7, 3, False)
     assert table.params["ATC_RAT_RLL_P"].value == pytest.approx(0.2)
@@ -53,8 +52,7 @@ def test_values_and_changes_have_the_times_of_the_log(cache: ParamCache, tmp_pat
 def test_types_are_from_the_cached_table_then_from_other_vehicles(cache: ParamCache, tmp_path: Path) -> None:
     hold(cache, Param("ARMING_CHECK", 1, ParamType.INT32, 2, 1), BOOT - 1000)
     hold(cache, Param("SYSID_THISMAV", 3, ParamType.INT16, 1, 3), BOOT - 1000, "uid:aabbccddeeff")
-    path = written(tmp_path, dataflash([*COMMON, FIX]))
-    result = anyio.run(import_onboard_log, path, cache)
+    result = anyio.run(import_onboard_log, written(tmp_path, dataflash([*COMMON, FIX])), cache)
     table = cache.component(KEY)
     types = {name: param.type for name, param in table.params.items()}
     assert types == {

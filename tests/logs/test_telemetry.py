@@ -97,8 +97,7 @@ async def test_missing_parameters_are_reported_at_the_end_of_the_log(tmp_path: P
         for _ in range(2):  # also after its end
             result = await component.fetch_all()
             assert (result.missing, result.count) == ((1,), 3)
-        together = await client.fetch_all()
-        assert together.results[1, 1].missing == (1,)
+        assert (await client.fetch_all()).results[1, 1].missing == (1,)
         await anyio.sleep(60.0)
         # the clock stops at the end of the log, so no component is lost
         assert component.state == "partial"

@@ -223,8 +223,7 @@ def test_parameters_with_different_descriptions_are_left_out() -> None:
     for name in ("Copter", "Plane"):
         rows = row.format(name, "SAME", "s") + row.format(name, "OTHER", name)
         vehicles += f'<parameters name="{name}">{rows}</parameters>'
-    read = read_content(f"<paramfile>{vehicles}</paramfile>".encode(), source="both")
-    assert list(read) == ["SAME"]
+    assert list(read_content(f"<paramfile>{vehicles}</paramfile>".encode(), source="both")) == ["SAME"]
 
 
 def px4(*rows: dict[str, Any], **more: Any) -> bytes:

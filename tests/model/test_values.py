@@ -270,8 +270,7 @@ def test_format_value_is_the_shortest_round_trip(pattern: int) -> None:
     text = values.format_value(value)
     if math.isfinite(value):
         assert struct.pack("<f", float(text)) == struct.pack("<f", value)
-        digits = Decimal(text).as_tuple().digits
-        assert len("".join(map(str, digits)).strip("0")) <= fewest_digits(value)
+        assert len("".join(map(str, Decimal(text).as_tuple().digits)).strip("0")) <= fewest_digits(value)
     else:
         assert text == repr(value)
 

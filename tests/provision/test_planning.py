@@ -210,8 +210,7 @@ def test_a_value_that_the_autopilot_cannot_store_must_be_forced(
     value: float, autopilot: str, says: str
 ) -> None:
     table, wanted = held(P=1.0), written(P=value)
-    made = plan_from(table, wanted, autopilot=autopilot, include=OUT_OF_RANGE)
-    status, category, reason = only_row(made)
+    status, category, reason = only_row(plan_from(table, wanted, autopilot=autopilot, include=OUT_OF_RANGE))
     assert (status, category) == (ApplyStatus.REFUSED, WRONG)
     assert says in reason
     assert order(plan_from(table, wanted, autopilot=autopilot, force=True)) == [["P"]]

@@ -179,8 +179,7 @@ def test_a_token_file_is_private_and_holds_digests(tmp_path: Path) -> None:
     token = add_token(file, "anna", "write")
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert token not in file.read_text()
-    other = add_token(file, "wall", "read")
-    assert other not in file.read_text()
+    assert add_token(file, "wall", "read") not in file.read_text()
     assert [*read_tokens(file).values()] == [("anna", "write"), ("wall", "read")]
     for again in ("anna", "two words", "", "x" * 33):
         with pytest.raises(UsageError):
@@ -209,7 +208,10 @@ def test_an_invalid_token_file_is_refused_without_its_content(tmp_path: Path, te
 
 BROKEN = [
     b"",
+    b"[]",
+    b"{",
     b"\xff\xfe\x00",
+    b'{"value": 1e999}',
     b'{"values": {"PARAM_04": ' + b"9" * 5_000 + b"}}",
     b'{"value": NaN, "values": NaN, "reason": NaN, "at": NaN, "refresh": NaN, "text": NaN}',
     b'{"value": "\\ud800", "values": {"\\ud800": "\\udfff"}, "reason": "\\ud800", "text": "\\ud800"}',
@@ -218,11 +220,17 @@ BROKEN = [
 ]
 REFUSED: list[tuple[str, str, dict[str, Any]]] = [
     ("PUT", "params/PARAM_04", {"value": 1, "settel_s": 1}),
+    ("PUT", "params/PARAM_04", {}),
     ("PUT", "params/PARAM_04", {"value": True}),
+    ("PUT", "params/PARAM_04", {"value": 1, "timeout_s": -1}),
     ("POST", "apply", {}),
     ("POST", "apply", {"values": {"PARAM_04": 1}, "at": 1}),
     ("POST", "apply", {"values": {}}),
+    ("POST", "plan", {"values": {"A_NAME_THAT_IS_LONG": 1}}),
+    ("POST", "restore", {"at": True}),
     ("POST", "restore", {"at": "2026-11-20T14:00"}),
+    ("POST", "snapshots", {"reason": ""}),
+    ("POST", "fetch", {"refresh": "maybe", "x": 1}),
 ]
 
 

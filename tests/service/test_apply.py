@@ -95,6 +95,8 @@ async def test_snapshots_are_stored_listed_read_and_applied(cache: str) -> None:
         assert (await browser.get(f"{V}/params", params=query)).json()["params"]["PARAM_04"]["value"] == 4
         plan = (await browser.post(f"{V}/plan", json=query)).json()
         assert [name for name, each in plan["params"].items() if each["status"] == "set"] == ["PARAM_04"]
+        assert "PARAM_04\t4\t" in (await browser.get(f"{V}/file", params=query)).text
+        problem(await browser.get(f"{V}/params?at=99"), 404, "not-in-cache")
 
 
 async def test_history_has_changes_of_all_or_of_one_name(cache: str) -> None:

@@ -675,8 +675,7 @@ async def test_rule_4_different_sets_queue() -> None:
         second = served.partner(system=9)
         await second.ask(set_to("PARAM_01", 9), seconds=0.01)
         await first.ask(set_to("PARAM_01", 33), seconds=5.0)
-        component = await served.clients[0].component()
-        assert (await component.get("PARAM_01")).value == 33
+        assert (await (await served.clients[0].component()).get("PARAM_01")).value == 33
         assert by_name(first)["PARAM_01"] == by_name(second)["PARAM_01"] == struct.pack("<i", 33)
 
 
@@ -1108,8 +1107,7 @@ async def test_rule_12_mavlink_1_only_to_a_station_of_it() -> None:
 
 async def test_rule_13_a_readonly_endpoint() -> None:
     async with in_sync(small_px4(), endpoint={"is_readonly": True}) as (_, vehicle, station):
-        mission = frames.build_frame(44, bytes(4), system=255, component=190, sequence=1)
-        station.send_bytes(mission)
+        station.send_bytes(frames.build_frame(44, bytes(4), system=255, component=190, sequence=1))
         harmless = messages.CommandLong(1, 1, 512, 148.0)
         await station.ask(set_to("PARAM_01", 33), messages.CommandLong(1, 1, 400), harmless, LIST, GCS)
         assert station.of(messages.ParamError) == [messages.ParamError(255, 190, "PARAM_01", -1, 5)]
@@ -1243,8 +1241,7 @@ async def test_a_switch_of_a_group_during_a_list() -> None:
     async with in_sync(switched()) as (served, _, station):
         station.send(GCS, LIST)
         await anyio.sleep(0.004)
-        component = await served.clients[0].component()
-        await component.set("GRP_ENABLE", 1.0)
+        await (await served.clients[0].component()).set("GRP_ENABLE", 1.0)
         await anyio.sleep(20.0)
         indexed = [each for each in station.of(ParamValue) if each.param_index != 65535]
         assert {each.param_count for each in indexed} == {301}

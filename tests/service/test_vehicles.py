@@ -72,8 +72,7 @@ async def test_ids_on_two_links_need_the_name_of_the_link_and_the_lowest_come_fi
         await synced(browser, "/api/vehicles/3/1")
         vehicles = (await browser.get("/api/vehicles")).json()["vehicles"]
         assert [each["system"] for each in vehicles] == [1, 1, 3]
-        reported = problem(await browser.get(f"{V}/params"), 409, "ambiguous")
-        assert reported["links"] == ["sim:a", "sim:b"]
+        assert problem(await browser.get(f"{V}/params"), 409, "ambiguous")["links"] == ["sim:a", "sim:b"]
         problem(await browser.get(f"{V}/params?link=sim:c"), 404, "unknown-vehicle")
 
 
@@ -93,6 +92,7 @@ async def test_a_value_is_written_read_back_and_read_from_the_vehicle() -> None:
         assert (written["actual"], written["status"]) == (44, "accepted")
         assert vehicle.param("PARAM_04").value == 44
         assert value(await browser.get(f"{V}/params/PARAM_04?live=true")) == 44
+        problem(await browser.put(f"{V}/params/NO_SUCH", json={"value": 1}), 404, "unknown-parameter")
 
 
 async def test_many_values_are_written_and_a_refused_one_stops_no_other() -> None:
@@ -116,6 +116,7 @@ async def test_values_out_of_range_are_refused_before_any_is_written(tmp_path: P
         assert vehicle.param("MC_PITCH_P").value != 5.0
         done = (await browser.patch(f"{V}/params", json={**body, "force": True})).json()
         assert [each["status"] for each in done["results"]] == ["accepted", "accepted"]
+        assert vehicle.param("MC_ROLL_P").value == high
 
 
 async def test_numbers_may_be_text_as_for_what_json_lacks() -> None:
