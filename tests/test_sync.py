@@ -138,8 +138,7 @@ def test_threads_share_a_client_and_closing_ends_their_calls() -> None:
 )
 def test_ctrl_c_ends_a_call_and_the_client_goes_on(call: Callable[[ParamClient], object]) -> None:
     with ParamClient(SILENT, cache=False) as client:
-        timer = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
+        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
         with pytest.raises(KeyboardInterrupt):
             call(client)
         with pytest.raises(errors.NoReply):
@@ -149,8 +148,7 @@ def test_ctrl_c_ends_a_call_and_the_client_goes_on(call: Callable[[ParamClient],
 def test_ctrl_c_cancels_the_calls_to_several_vehicles() -> None:
     with ParamClient("sim:px4", cache=False) as client:
         vehicle, changes = client.only_component(), client.component().changes()
-        timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
+        threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
         with pytest.raises(KeyboardInterrupt):
             for_each(
                 [vehicle], lambda each: apply(each, {NAME: 6.5}, before_writing=lambda: changes.next(60.0))

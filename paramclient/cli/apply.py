@@ -186,7 +186,8 @@ async def _from_file(
         params = choose(file, session.choice.component, session.component.system)
         own, origin = session.component.identity, params.identity
         has_uid = origin is not None and origin.uid is not None
-        is_named = own.uid and any(own.uid in each for each in (params.source, *file.header))
+        header = file.header if len(file.sets) == 1 else ()  # that of several vehicles names all of them
+        is_named = own.uid and any(own.uid in each for each in (params.source, *header))
         if own.uid and not has_uid and (session.choice.uid or is_named):
             params = replace(params, identity=replace(origin or own, uid=own.uid))
         return State(params, is_restore, partial, ExitCode.USAGE if file.left_out else ExitCode.DONE)

@@ -329,9 +329,11 @@ def filled(pattern: str, vehicle: Component | ParamSet, label: str) -> str:
     """Return a file name with the placeholders replaced by the ids of a vehicle, which is `label` in words.
 
     Raises:
-        UsageError: the name has `{uid}`, and the vehicle reports no hardware id.
+        UsageError: the name has `{uid}` or `{system}`, and that of the vehicle is not known.
     """
     uid = None if vehicle.identity is None else vehicle.identity.uid
     if uid is None and "{uid}" in pattern:
         raise UsageError(f"{label} does not report a hardware id, which {pattern} needs")
+    if vehicle.system is None and "{system}" in pattern:
+        raise UsageError(f"{label} has no system id, which {pattern} needs")
     return pattern.replace("{uid}", uid or "").replace("{system}", str(vehicle.system))

@@ -271,7 +271,7 @@ def _number(content: object) -> Value:
         if match := _raw(content):
             return int(match[1], 16).to_bytes((len(match[1]) + 1) // 2, "little")
     elif isinstance(content, int | float) and not isinstance(content, bool):
-        if not math.isinf(content):
+        if abs(content) < 2**1024:
             return content
         raise UsageError("the number is beyond the range of a double")
     raise UsageError(f"expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes){_found(content)}")

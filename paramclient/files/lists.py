@@ -230,8 +230,7 @@ def qgc_line(params: ParamSet, param: WrittenParam) -> str:
     text = value_text(param)
     if isinstance(param.value, float) and not math.isfinite(param.value):
         text = text.lower().removesuffix("inity")  # Qt's notation
-    name = check_portable_name(param.name)
-    return f"{params.system}\t{component}\t{name}\t{text}\t{int(param.type)}"
+    return f"{params.system}\t{component}\t{check_portable_name(param.name)}\t{text}\t{int(param.type)}"
 
 
 def _whole(text: str, low: int, high: int, expected: str) -> int:

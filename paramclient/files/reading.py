@@ -253,12 +253,11 @@ def parse_number(text: str) -> int | float | None:
     digits and numbers beyond the range of a double give None.
     """
     found = _number(text) if len(text) <= NUMBER_LENGTH_MAX else None
-    if found is None:
-        return None
-    if found.lastgroup in ("whole", "hexadecimal"):
-        return int(text, 10 if found.lastgroup == "whole" else 16)
-    value = float(text)
-    return value if found.lastgroup == "word" or math.isfinite(value) else None
+    if found is None or found.lastgroup == "word":
+        return None if found is None else float(text)
+    bases = {"whole": 10, "hexadecimal": 16}
+    value = int(text, bases[found.lastgroup]) if found.lastgroup in bases else float(text)
+    return value if abs(value) < 2**1024 else None
 
 
 def as_type(value: Value, kind: ParamType | int) -> Value:

@@ -258,8 +258,7 @@ def _named(items: Mapping[str, str] | str) -> dict[int | float, str]:
 
 
 def _named_bits(items: Mapping[str, str] | str) -> Mapping[int, str]:
-    named = _named(items).items()
-    return {bit: name for bit, name in named if isinstance(bit, int) and 0 <= bit < BITS_MAX}
+    return {bit: name for bit, name in _named(items).items() if isinstance(bit, int) and 0 <= bit < BITS_MAX}
 
 
 def _number(text: str) -> int | float | None:

@@ -158,5 +158,4 @@ def version_difference(file: Identity, vehicle: Identity) -> str:
     own, other = version_text(file.firmware), version_text(vehicle.firmware)
     if 0 in (file.firmware, vehicle.firmware) or own == other:
         return ""
-    autopilot = _BRANDS.get(file.autopilot, "version")
-    return f"the file is of {autopilot} {own}, the vehicle has {other}"
+    return f"the file is of {_BRANDS.get(file.autopilot, 'version')} {own}, the vehicle has {other}"

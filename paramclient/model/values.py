@@ -279,15 +279,16 @@ def check_number(value: object, wanted: str = "a parameter value is a number") -
     """Convert a number, also of another library, to an int or a float.
 
     Raises:
-        UsageError: it is no number in the range of a float; the text says what is `wanted`.
+        UsageError: it is no number in the range of a float64; the text says what is `wanted`.
     """
     try:
         if isinstance(value, SupportsIndex):
-            return value.__index__()
+            float(number := value.__index__())  # OverflowError beyond its range
+            return number
         if isinstance(value, SupportsFloat):
             return float(value)
     except (ArithmeticError, TypeError, ValueError) as error:
-        raise UsageError(f"{wanted} in the range of a float: {error}") from error
+        raise UsageError(f"{wanted} in the range of a float32 or float64: {error}") from error
     raise UsageError(f"{wanted}, not {type(value).__name__}")
 
 

@@ -87,8 +87,7 @@ def test_downloaded_metadata_is_stored(command: Command, put: Put) -> None:
     assert "1/s" in command("get", put(vehicle), "MC_ROLL_P").out
     assert not vehicle.requests["FILE_TRANSFER_PROTOCOL"]
     assert "units" not in command("get", put(copter(system=2)), "TST_LOG").out
-    done = command("set", put(quad()), "MC_ROLL_P", 13)
-    assert "above the maximum of 12" in done.err
+    assert "above the maximum of 12" in command("set", put(quad()), "MC_ROLL_P", 13).err
     assert "Gain from the error of the roll angle" in command("show", "1", "MC_ROLL_P").out
 
 

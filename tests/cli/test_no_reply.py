@@ -94,8 +94,7 @@ def test_a_terminal_shows_what_is_awaited(
     command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use_terminal(monkeypatch)
-    done = command("get", put(Station({}, system=252, component=190)), "A", "--timeout", 3.2)
-    texts = drawn(done.err)
+    texts = drawn(command("get", put(Station({}, system=252, component=190)), "A", "--timeout", 3.2).err)
     received = "Heard on sim:custom so far: only 252/190 ground station, an"
     assert texts[0] == "waiting for an autopilot on sim:custom (0 s). " + received[: 99 - 46]
     assert texts[-2].startswith("waiting for an autopilot on sim:custom (3 s). ")

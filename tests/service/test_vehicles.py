@@ -107,8 +107,7 @@ async def test_values_out_of_range_are_refused_before_any_is_written(tmp_path: P
     vehicle = PX4Vehicle(metadata=True)
     async with browsing(vehicle, cache=str(tmp_path / "cache.sqlite3")) as browser:
         await browser.post(f"{V}/fetch", json={"metadata": True})
-        known = (await browser.get(f"{V}/params/MC_ROLL_P")).json()
-        high = known["metadata"]["maximum"] + 1
+        high = (await browser.get(f"{V}/params/MC_ROLL_P")).json()["metadata"]["maximum"] + 1
         body: dict[str, Any] = {"values": {"MC_PITCH_P": 5.0, "MC_ROLL_P": high}}
         reported = problem(await browser.patch(f"{V}/params", json=body), 422, "out-of-range")
         assert reported["names"] == ["MC_ROLL_P"]
