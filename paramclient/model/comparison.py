@@ -162,8 +162,7 @@ def compare(
 def non_defaults(params: ParamSet) -> ParamSet:
     """Return the parameters that differ from the firmware's defaults, as far as these are known."""
     defaults = {name: default for name, param in params.items() if (default := _default_of(param))}
-    differing = {name: params[name] for name in defaults if not same_value(params[name], defaults[name])}
-    return replace(params, params=differing)
+    return replace(params, params={n: params[n] for n in defaults if not same_value(params[n], defaults[n])})
 
 
 def same_value(left: WrittenParam, right: WrittenParam) -> bool:

@@ -69,8 +69,7 @@ class WrittenParam:
         kind = None if type is None else ParamType(type)
         if isinstance(value, bytes) and (is_raw or kind != ParamType.CUSTOM):
             value, is_raw = int.from_bytes(value, "little"), True
-        default = None if isinstance(default, bytes) else default
-        given = (name, value, kind, default, comment, line, is_raw)
+        given = (name, value, kind, None if isinstance(default, bytes) else default, comment, line, is_raw)
         for attribute, each in zip(fields(self), given, strict=True):
             object.__setattr__(self, attribute.name, each)
 
@@ -108,6 +107,8 @@ AnyParams: TypeAlias = Mapping[str, WrittenParam | Param | Settable]
 def _written(name: str, given: WrittenParam | Param | Settable, is_extended: bool) -> WrittenParam:
     """Return a parameter. Of plain values, text and bytes that are not four are extended ones."""
     if isinstance(given, WrittenParam | Param):
+        if given.name != name:
+            raise UsageError(f"{name} is given as the parameter {given.name}; a value alone is set")
         return given if isinstance(given, WrittenParam) else WrittenParam.of(given)
     value = check_ext_value(given) if is_extended else check_value(given)
     is_raw = isinstance(value, bytes) and len(value) == WIRE_SIZE

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 import anyio
@@ -118,7 +119,7 @@ class ApplyOptions(PlanOptions, total=False):
         allow_armed: continue if the vehicle is armed.
         durable: return only when the values and their history are on the disk and survive a power loss; if
             that fails, `error` of the result is a CacheError.
-        backup: a file for the state before the first write; its name determines the file format, see
+        backup: a new file for the state before the first write; its name determines the file format, see
             `paramclient.files`.
         timeout: seconds, after which the result reports the progress of the run.
         author: the author of the changes, as in `Component.set`.
@@ -184,6 +185,8 @@ class _Run:
         self, component: Component, wanted: ParamSet, options: ApplyOptions, *, is_restore: bool
     ) -> None:
         check_author(options.get("author"))
+        if (backup := options.get("backup")) and Path(backup).exists():
+            raise UsageError(f"nothing was sent: the backup file {backup} exists already")
         self.component, self.wanted, self.options = component, wanted, options
         self.is_restore, self._reboots_allowed = is_restore, options.get("reboot", False)
         self._planned = PlanOptions(
@@ -250,9 +253,9 @@ class _Run:
                 )
             )
         except CacheError as error:
+            why = f"nothing was sent, as the state before cannot be stored: {error}"
             raise CacheError(
-                f"nothing was sent, as the state before cannot be stored: {error}. Without a cache"
-                " (--no-cache, or cache=False), no state is stored"
+                f"{why}. Without a cache (--no-cache, or cache=False), none is stored"
             ) from error
         self._snapshot = snapshot.id
 
@@ -311,10 +314,8 @@ class _Run:
 
     def _must_reboot(self, done: Sequence[Stage]) -> bool:
         """Return whether the vehicle must reboot after the stages that are done."""
-        if not self._reboots_allowed:
-            return False
-        if done:
-            return done[-1].reboot_first and bool(self._reboot_for)
+        if done or not self._reboots_allowed:
+            return self._reboots_allowed and done[-1].reboot_first and bool(self._reboot_for)
         is_reboot_due = bool(self._plan.awaiting_reboot) or self._pending_system_id() is not None
         return bool(self._reboot_for) or (is_reboot_due and not self._reboots)
 
@@ -427,8 +428,7 @@ class _Run:
             is_ours = own.has_own_uid and known.identity.uid == own.uid  # under an earlier id
             is_there = known.system == system != component.system and known.state != "lost"
             if is_there and not is_ours:
-                reason = f"another vehicle on this link has system id {system}"
-                self._settle(row, ApplyStatus.REFUSED, reason, WRONG)
+                self._settle(row, ApplyStatus.REFUSED, f"another vehicle on this link has id {system}", WRONG)
                 return
         if row.needs_reboot:
             await self._write([row])
@@ -495,8 +495,8 @@ class _Run:
             problem = f"does not report whether it is armed (no heartbeat within {ARMED_STATE_TIMEOUT:g} s)"
         else:
             return
-        message = f"{component.system}/{component.component} {problem}; nothing is set then"
-        raise VehicleArmed(message, system=component.system, component=component.component)
+        what = f"{component.system}/{component.component} {problem}; nothing is set then"
+        raise VehicleArmed(what, *component.address)
 
     # Outcomes
 

@@ -164,8 +164,7 @@ def test_nan_can_be_forced(command: Command) -> None:
     assert refused.code == 2
     assert [each["status"] for each in refused.json["results"]] == ["refused", "refused", "accepted"]
     assert "PX4 cannot save NaN and infinity" in refused.json["results"][0]["reason"]
-    done = command("set", "sim:px4", *wanted, "--force", "--json", "--no-cache")
-    assert done.json["results"] == [
+    assert command("set", "sim:px4", *wanted, "--force", "--json", "--no-cache").json["results"] == [
         {"name": "MC_ROLL_P", "requested": "NaN", "actual": "NaN", "status": "accepted"},
         {"name": "MC_PITCH_P", "requested": "-Infinity", "actual": "-Infinity", "status": "accepted"},
     ]

@@ -194,8 +194,7 @@ def test_no_key_shows(
             try:
                 raise RuntimeError
             except RuntimeError as error:
-                reported = traceback.TracebackException.from_exception(error, capture_locals=True)
-                shown.extend(reported.format())
+                shown.extend(traceback.TracebackException.from_exception(error, capture_locals=True).format())
 
     live()
     printed = capsys.readouterr()

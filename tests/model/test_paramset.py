@@ -31,6 +31,8 @@ def test_plain_values_have_names_that_a_parameter_can_have() -> None:
             ParamSet(each)
     with pytest.raises(UsageError, match="component ids 0 to 255, not 300"):
         ParamSet({}, component=300)
+    with pytest.raises(UsageError, match="A is given as the parameter B"):
+        ParamSet({"A": WrittenParam("B", 1)})
 
 
 @pytest.mark.parametrize(

@@ -185,7 +185,9 @@ async def test_the_state_is_stored_before_anything_is_sent(
             await apply(component, some("TUNE_01"), dry_run=True)  # type: ignore[call-arg]
         assert sets(tap) == []
         first = await apply(component, some("TUNE_01"))
-        await apply(component, some("TUNE_01"))  # nothing to write, no snapshot
+        await apply(component, some("TUNE_01"), backup=tmp_path / "a.json")  # nothing to write, no snapshot
+        with pytest.raises(UsageError, match=r"nothing was sent: the backup file .*a\.json exists already"):
+            await apply(component, some("TUNE_02"), backup=tmp_path / "a.json")
         key = component.identity.key
     (summary,) = cache.snapshots(key, 1)
     assert summary.reason == "before apply"
@@ -462,8 +464,7 @@ def test_the_next_run_completes_after_an_interruption_anywhere(
         with ParamCache(tmp_path_factory.mktemp("cache") / "cache.sqlite3") as cache:
             air = Air.symmetric([vehicle], loss=loss, seed=seed)
             await interrupted(air, wanted, cache, frames=frames, how=how, **options)
-            air = Air.symmetric([vehicle], loss=loss, seed=seed + 1)
-            async with ParamClient(air, cache=cache) as client:
+            async with ParamClient(Air.symmetric([vehicle], loss=loss, seed=seed + 1), cache=cache) as client:
                 result = await apply(await client.component(), wanted, **options)
             assert result.complete, result.rows
             assert truth() == before | wanted

@@ -128,8 +128,7 @@ async def test_numbers_may_be_text_as_for_what_json_lacks() -> None:
 
 
 async def test_fetches_at_one_time_share_a_download_and_tell_their_progress() -> None:
-    tap = Tap(small_px4())
-    async with service(tap, fetches=False) as (_, browser):
+    async with service(Tap(small_px4()), fetches=False) as (_, browser):
         await until(browser, "/api/vehicles", lambda found: bool(found["vehicles"]))
         results = await asyncio.gather(*(browser.post(f"{V}/fetch", json={}) for _ in range(3)))
         assert {answer.json()["received"] for answer in results} == {len(VALUES) + 1}
