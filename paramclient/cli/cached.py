@@ -75,8 +75,8 @@ def show_summaries(cache: ParamCache, summaries: Sequence[CachedSummary], *, jso
 async def import_(file: Path, /, *files: Path, options: CacheOptions = CacheOptions()) -> int:
     """Import logs into the cache: vehicles, tables and changes, with the times of the logs.
 
-    Later values in the cache are kept, so neither order nor repetition matters. All files are tried even if
-    one cannot be read.
+    Later values in the cache are kept. Import logs in the order of their times, or a change may be dated
+    later. All files are tried even if one cannot be read.
 
     Args:
         file: A telemetry log (.tlog), or an on-board log of ArduPilot (.bin) or PX4 (.ulg).
