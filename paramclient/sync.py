@@ -19,7 +19,7 @@ from typing import Any
 from paramclient import metadata, provision
 from paramclient.client.blocking import Changes, Component, Events, ParamClient, blocking, call_each
 from paramclient.client.client import Event
-from paramclient.provision.planning import Wanted
+from paramclient.model.paramset import AnyParams
 
 __all__ = [
     "Changes",
@@ -27,7 +27,7 @@ __all__ = [
     "Event",
     "Events",
     "ParamClient",
-    "Wanted",
+    "AnyParams",
     "apply",
     "for_each",
     "metadata_of",

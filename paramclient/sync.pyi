@@ -14,7 +14,7 @@ from paramclient.links import Link
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.store import MetadataStore
 from paramclient.model.identity import Identity
-from paramclient.model.paramset import ParamMap, ParamSet
+from paramclient.model.paramset import ParamMap, WrittenParam
 from paramclient.model.values import Encoding, Param, Settable
 from paramclient.protocol import ftp
 from paramclient.protocol.addresses import Address
@@ -29,12 +29,12 @@ from paramclient.sim import Endpoint
 from paramclient.wire.signing import SigningKey, SigningReport
 
 __all__ = [
+    "AnyParams",
     "Changes",
     "Component",
     "Event",
     "Events",
     "ParamClient",
-    "Wanted",
     "apply",
     "for_each",
     "metadata_of",
@@ -166,7 +166,7 @@ class Component:
     def changes(self) -> Changes:
         """Return a stream of parameter changes from now on: `async for change in component.changes()`."""
 
-Wanted: TypeAlias = ParamSet | Mapping[str, Settable]
+AnyParams: TypeAlias = Mapping[str, WrittenParam | Param | Settable]
 
 class Changes(Iterator[Change]):
     """Stream of the changes since its creation; see `Component.changes`."""
@@ -277,13 +277,13 @@ class ParamClient:
     def signing_report(self) -> SigningReport | None:
         """Return the signing statistics of the link: signed frames, and refused frames with the reasons."""
 
-def plan(component: Component, wanted: Wanted, **options: Unpack[PlanOptions]) -> Plan:
+def plan(component: Component, wanted: AnyParams, **options: Unpack[PlanOptions]) -> Plan:
     """Return what `apply` would write to a vehicle, and in which order. Only reads."""
 
-def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
+def apply(component: Component, wanted: AnyParams, **options: Unpack[ApplyOptions]) -> ApplyResult:
     """Write the wanted values to a vehicle, and verify each of them by reading it back at the end."""
 
-def restore(component: Component, state: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
+def restore(component: Component, state: AnyParams, **options: Unpack[ApplyOptions]) -> ApplyResult:
     """Restore an earlier state of a vehicle: `apply`, with its own identity and calibration included."""
 
 def for_each(components: Iterable[Component], call: Callable[[Component], Outcome]) -> FleetResult[Outcome]:

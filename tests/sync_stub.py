@@ -12,13 +12,13 @@ from types import ModuleType
 
 from paramclient import metadata, provision
 from paramclient.client import client, component, streams
-from paramclient.provision import planning
+from paramclient.model import paramset
 
 STUB = Path(__file__).parent.parent / "paramclient" / "sync.pyi"
 
 CLASSES: dict[ModuleType, list[str]] = {
     component: ["Component"],
-    planning: ["Wanted"],
+    paramset: ["AnyParams"],
     streams: ["Changes"],
     client: ["Event", "Events", "ParamClient"],
 }

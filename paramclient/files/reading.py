@@ -253,10 +253,12 @@ def parse_number(text: str) -> int | float | None:
     digits and numbers beyond the range of a double give None.
     """
     found = _number(text) if len(text) <= NUMBER_LENGTH_MAX else None
-    if found is None or found.lastgroup == "word":
-        return None if found is None else float(text)
-    bases = {"whole": 10, "hexadecimal": 16}
-    value = int(text, bases[found.lastgroup]) if found.lastgroup in bases else float(text)
+    if found is None:
+        return None
+    if found.lastgroup == "word":
+        return float(text)
+    base = {"whole": 10, "hexadecimal": 16}.get(found.lastgroup or "")
+    value = float(text) if base is None else int(text, base)
     return value if abs(value) < 2**1024 else None
 
 

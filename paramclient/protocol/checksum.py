@@ -119,9 +119,8 @@ async def prove(session: Session) -> None:
             raise FileUnavailable(f"the checksum was refused: {error.reason}") from None
         except NoReply as error:
             session.ftp_unanswered += error.attempts
-            raise FileUnavailable(
-                "MAVFTP did not answer", is_silent=session.serves_checksum is None
-            ) from None
+            is_silent = session.serves_checksum is None
+            raise FileUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
     raise TableDiffers(OTHER)
 
 

@@ -364,10 +364,10 @@ class Table:
 
     # trust
 
-    def doubt(self) -> None:
-        """Mark all values as cached: the component was lost, or has rebooted."""
-        for name, param in self.params.items():
-            self.params[name] = param.with_trust(Trust.CACHED)
+    def doubt(self, *names: str) -> None:
+        """Mark values as cached, or all: the component was lost, or has rebooted."""
+        for name in names or self.params:
+            self.params[name] = self.params[name].with_trust(Trust.CACHED)
 
     def verify(self) -> None:
         """Mark the cached values that the confirmed hash covers as verified."""

@@ -13,11 +13,11 @@ from paramclient.cache import ParamCache
 from paramclient.client.component import Component
 from paramclient.errors import AlreadyRestored, NotInCache, ParamClientError, UnknownVehicle, UsageError
 from paramclient.model.names import age_in_words
-from paramclient.model.paramset import ParamSet, RestorePoint, set_of
+from paramclient.model.paramset import AnyParams, ParamSet, RestorePoint, set_of
 from paramclient.provision.apply_rules import OUT_OF_RANGE
 from paramclient.provision.execution import BEFORE_APPLY, BEFORE_RESTORE, ApplyOptions, ApplyResult, run
 from paramclient.provision.inspection import wait_for_identity
-from paramclient.provision.planning import Rows, Wanted
+from paramclient.provision.planning import Rows
 
 Outcome = TypeVar("Outcome", bound=Rows)
 
@@ -28,7 +28,7 @@ CONTINUATION_MAX: Final = 3600.0
 otherwise since."""
 
 
-async def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
+async def apply(component: Component, wanted: AnyParams, **options: Unpack[ApplyOptions]) -> ApplyResult:
     """Write the wanted values to a vehicle, and verify each of them by reading it back at the end.
 
     All or nothing: if a value is invalid, or the vehicle does not have a name, nothing is written unless
@@ -63,7 +63,7 @@ async def apply(component: Component, wanted: Wanted, **options: Unpack[ApplyOpt
     return await run(component, set_of(wanted, is_extended=component.is_extended), options, is_restore=False)
 
 
-async def restore(component: Component, state: Wanted, **options: Unpack[ApplyOptions]) -> ApplyResult:
+async def restore(component: Component, state: AnyParams, **options: Unpack[ApplyOptions]) -> ApplyResult:
     """Restore an earlier state of a vehicle: `apply`, with its own identity and calibration included.
 
     Parameters that the vehicle measures at each start, counts, or does not let clients write are not changed:

@@ -10,9 +10,9 @@ import anyio
 
 from paramclient.client.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
-from paramclient.model.paramset import ParamSet, set_of
+from paramclient.model.paramset import AnyParams, ParamSet, set_of
 from paramclient.model.values import Param, ParamType, Trust
-from paramclient.provision.planning import Plan, PlanOptions, Wanted, plan_from
+from paramclient.provision.planning import Plan, PlanOptions, plan_from
 from paramclient.provision.sources import component_set, part_set
 
 READS_IN_PROGRESS_MAX: Final = 64
@@ -28,7 +28,7 @@ READ_SIZE_RATIO: Final = 6.0
 """Bytes of a read and its response, 73, over those of one parameter in ArduPilot's file, 13 (measured)."""
 
 
-async def plan(component: Component, wanted: Wanted, **options: Unpack[PlanOptions]) -> Plan:
+async def plan(component: Component, wanted: AnyParams, **options: Unpack[PlanOptions]) -> Plan:
     """Return what `apply` would write to a vehicle, and in which order. Only reads.
 
     The plan is `complete` if the vehicle has all wanted values.

@@ -11,15 +11,15 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final, TypeAlias, TypedDict, Unpack
+from typing import Final, TypedDict, Unpack
 
 from paramclient.errors import UsageError
 from paramclient.metadata import ParamInfo
 from paramclient.model.comparison import same_value
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
 from paramclient.model.names import is_group_switch, nearest_names
-from paramclient.model.paramset import ParamSet, WrittenParam, set_of
-from paramclient.model.values import Encoding, Param, ParamType, Settable, Value, format_value
+from paramclient.model.paramset import AnyParams, ParamSet, WrittenParam, set_of
+from paramclient.model.values import Encoding, Param, ParamType, Value, format_value
 from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.provision.apply_rules import ACTION, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
 
@@ -30,10 +30,6 @@ WRONG: Final = "wrong"
 SUGGESTIONS_MAX: Final = 40
 """Missing names up to which similar names are suggested. With more, the file is for another vehicle and has
 no typing errors."""
-
-
-Wanted: TypeAlias = ParamSet | Mapping[str, Settable]
-"""The wanted parameters: of a file or a snapshot, or plain values by name."""
 
 
 class PlanOptions(TypedDict, total=False):
@@ -254,7 +250,7 @@ class Plan(Rows):
 
 def plan_from(
     current: ParamSet | Mapping[str, Param],
-    wanted: Wanted,
+    wanted: AnyParams,
     *,
     autopilot: str | None = None,
     encoding: Encoding | None = None,

@@ -472,7 +472,7 @@ class Hub:
                         self._take(link, event, tasks)
                     self._set_state(link, "ended")
                     await anyio.sleep_forever()
-            except Exception as error:  # UsageError: a missing library
+            except Exception as error:
                 if not isinstance(error, ParamClientError):
                     logger.exception("%s: an error of the program, which ends no other link", link.name)
                 self._set_state(link, "failed", str(error))

@@ -432,8 +432,8 @@ class KeptTable(Stream[Change]):
         if code:
             self._reject(askers, key, code)
         name = self.session.spelled(key[0])
-        if code == ParamErrorCode.COMPONENT_NOT_FOUND and (known := known_param(self.session, name)):
-            self.session.table.params[name] = known.with_trust(Trust.CACHED)  # it may have the new value
+        if code == ParamErrorCode.COMPONENT_NOT_FOUND and known_param(self.session, name):
+            self.session.table.doubt(name)  # it may have the new value
             self.changes += 1
             self.component.core.spawn(read_again, self.session, name, anyio.current_time())
 
