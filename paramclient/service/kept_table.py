@@ -23,6 +23,7 @@ from paramclient.model.values import (
     as_reported,
     ext_bytes,
 )
+from paramclient.protocol.channel import task_group
 from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.reads import read, read_again
 from paramclient.protocol.session import Session
@@ -416,15 +417,23 @@ class KeptTable(Stream[Change]):
             self.component.core.spawn(self._set, key, asker)
 
     async def _set(self, key: SetKey, first: Asker) -> None:
-        """Write a value, and write it again while a result may wait behind the list of a fetch."""
-        code, is_open = int(ParamErrorCode.COMPONENT_NOT_FOUND), True
+        """Write a value, and write it again while a result may wait behind the list of a fetch.
+
+        Where that keeps the radio's queue full, a value that it has brought before is read as late.
+        """
+        code, is_open, table = int(ParamErrorCode.COMPONENT_NOT_FOUND), True, self.session.table
         try:
             while is_open:
-                beats_min = self.beats + OVERTAKING_BEATS * self.is_loading
+                began, beats_min = anyio.current_time(), self.beats + OVERTAKING_BEATS
+                known = table.names.get(min(table.names, default=-1), key[0]) if self.is_loading else None
                 with anyio.move_on_after(SET_TIMEOUT) as scope:
-                    async with first.station.writing:
-                        code = await self._write(key, f"station {first.system}/{first.component}", scope)
-                is_open = scope.cancelled_caught and self.beats < beats_min
+                    async with first.station.writing, task_group() as tasks:
+                        if known is not None:
+                            tasks.start_soon(read_again, self.session, known, began)
+                        code = await self._write(key, f"station {first.system}/{first.component}")
+                        tasks.cancel_scope.cancel()
+                is_late = table.moments.get(known or "", began) - began > SET_TIMEOUT / 2
+                is_open = scope.cancelled_caught and known is not None and (self.beats < beats_min or is_late)
         except ParamClientError as error:
             code = _code_of(error)
         finally:
@@ -437,11 +446,10 @@ class KeptTable(Stream[Change]):
             self.changes += 1
             self.component.core.spawn(read_again, self.session, name, anyio.current_time())
 
-    async def _write(self, key: SetKey, author: str, scope: anyio.CancelScope) -> ParamErrorCode:
+    async def _write(self, key: SetKey, author: str) -> ParamErrorCode:
         """Write a value, and acknowledge it to the askers.
 
-        A component that takes values byte by byte takes those of its own type only. Where a read of it was
-        answered late, behind the list of a fetch, an acknowledgement will be too: the time begins anew.
+        A component that takes values byte by byte takes those of its own type only.
 
         Raises:
             ParamClientError: as from `Component.set`.
@@ -454,8 +462,6 @@ class KeptTable(Stream[Change]):
         askers, params = self._sets[key], session.table.params
         if name not in params or params[name].trust is Trust.CACHED:
             await read(session, name)
-            if self.is_loading:
-                scope.deadline = anyio.current_time() + SET_TIMEOUT
         if name not in params:  # it is not stored
             return ParamErrorCode.DOES_NOT_EXIST
         known = params[name].type
@@ -491,9 +497,8 @@ class KeptTable(Stream[Change]):
     def _refuse(self, askers: Iterable[Asker], which: Which, code: int) -> None:
         """Send a PARAM_ERROR to each asker, with its ids: others would take it for their own requests."""
         name, index = (which, -1) if isinstance(which, str) else ("", which)
-        for station, system, component in askers:
-            if not (self.session.dialect.has_ack or self.is_lost):
-                station.say(messages.ParamError(system, component, name, index, code), self.source)
+        for asker in () if self.session.dialect.has_ack else askers:
+            self._say([asker], messages.ParamError(asker.system, asker.component, name, index, code))
 
 
 def _code_of(error: ParamClientError) -> int:

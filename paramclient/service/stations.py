@@ -7,6 +7,7 @@ import math
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
+from itertools import cycle
 from typing import Any, Final, TypeAlias
 
 import anyio
@@ -136,7 +137,7 @@ class GroundStation:
         self._numbering: defaultdict[Source, Numbering] = defaultdict(Numbering)
         self._queue: deque[tuple[float, Source, bytes | Message | None, bool]] = deque()  # None: withheld
         self._streams: dict[Hashable, tuple[Source, Iterator[Message]]] = {}
-        self._is_turn_of_streams = False
+        self._turns = cycle((self._next_of_streams, self._next_of_queue))  # neither holds the other up
         self._held: bytes | None = None  # numbered, but too long for the last datagram
         self._something_to_send = anyio.Event()
 
@@ -192,7 +193,7 @@ class GroundStation:
         frames: list[bytes] = []
         size = 0
         while len(frames) < FRAMES_PER_DATAGRAM:
-            data, self._held = self._held or self._next_frame(), None
+            data, self._held = self._held or next(self._turns)() or next(self._turns)(), None
             if data is None:
                 break
             if frames and size + len(data) > DATAGRAM_SIZE:
@@ -224,12 +225,6 @@ class GroundStation:
             self._something_to_send.set()
         else:
             self.dropped += 1
-
-    def _next_frame(self) -> bytes | None:
-        self._is_turn_of_streams = not self._is_turn_of_streams
-        if self._is_turn_of_streams:  # so that more telemetry than the link carries holds no list up
-            return self._next_of_streams() or self._next_of_queue()
-        return self._next_of_queue() or self._next_of_streams()
 
     def _next_of_queue(self) -> bytes | None:
         while self._queue:

@@ -17,9 +17,9 @@ from paramclient.service.gateway import Gateway
 from paramclient.service.stations import MavlinkEndpoint
 from paramclient.sim import Endpoint
 from paramclient.wire.frames import Frame, Framer, sign_frame
-from paramclient.wire.messages import DECODED_IDS, FileTransfer, Message, decode, encode
+from paramclient.wire.messages import DECODED_IDS, FileTransfer, Heartbeat, Message, decode, encode
 from paramclient.wire.signing import Signer, SigningKey, SigningPolicy, Verifier
-from tests.shell import PeersLink, a_client
+from tests.shell import PeersLink, a_client, until
 
 T = TypeVar("T")
 
@@ -173,6 +173,13 @@ class Served:
     def partner(self, **options: Any) -> Partner:
         """A new ground station; it is known from its first frame on."""
         return Partner(self.link, **options)
+
+    async def heard(self) -> Partner:
+        """A new ground station, which has heard a vehicle."""
+        station = self.partner()
+        station.send(Heartbeat(6, 8))
+        await until(lambda: station.frames)
+        return station
 
     def as_vehicles(self) -> Endpoint:
         """The gateway as another one sees it: an endpoint with the vehicles."""
