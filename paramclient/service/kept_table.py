@@ -119,7 +119,6 @@ def value_of(session: Session, param: Param, *, index: int | None = None) -> Rep
         index: of the parameter in an answer by index; None for an answer by name, and for a change: an
             ArduPilot sends these without an index.
     """
-    count = session.table.count or 0
     if index is None:
         index = NO_INDEX if param.index is None or session.identification.is_ardupilot else param.index
     if session.dialect.has_ack:
@@ -128,7 +127,7 @@ def value_of(session: Session, param: Param, *, index: int | None = None) -> Rep
         raw = param.bits.to_bytes(WIRE_SIZE, "little")
     else:
         raw = as_reported(param.bits, param.type, session.table.encoding)
-    return session.dialect.value(param.name, raw, param.type, count, index)
+    return session.dialect.value(param.name, raw, param.type, session.table.count or 0, index)
 
 
 def digest_of(session: Session) -> messages.ParamValue | None:

@@ -527,8 +527,7 @@ def _metrics(hub: Hub) -> Iterator[tuple[str, Sequence[tuple[Mapping[str, object
     yield "link_bytes_received_total", [(at, each.bytes_received) for at, each in clients]
     yield "link_bytes_sent_total", [(at, each.bytes_sent) for at, each in clients]
 
-    tables = [(target.address, target.component) for target in hub.targets]
-    yield "component_synced", [(at, each.sync_state == "synced") for at, each in tables]
+    yield "component_synced", [(each.address, each.component.sync_state == "synced") for each in hub.targets]
 
     endpoints = [({"endpoint": each.name}, each.stations.values()) for each in hub.gateway.endpoints]
     yield "stations", [(at, len(stations)) for at, stations in endpoints]

@@ -8,13 +8,14 @@ recognized by the header Origin, which browsers send with every write.
 
 from __future__ import annotations
 
-import contextlib
+import asyncio
 import hashlib
 import os
 import re
 import secrets
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
@@ -45,7 +46,7 @@ CONNECTIONS_MAX: Final = 200
 IDLE_TIMEOUT: Final = 30
 """Seconds after which an idle connection is closed."""
 SHUTDOWN_TIMEOUT: Final = 1
-"""Seconds for responses in progress at shutdown; their requests are then cancelled."""
+"""Seconds for responses in progress at shutdown; their connections are then closed."""
 
 
 # tokens
@@ -306,6 +307,19 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+class _Server(uvicorn.Server):
+    """uvicorn without signal handlers: the command has its own."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+    def disconnect(self) -> None:
+        """Close the connections, which cancels their requests: uvicorn itself would log each as an error."""
+        for connection in list(self.server_state.connections):
+            connection.transport.abort()
+
+
 async def serve(
     hub: Hub,
     address: str,
@@ -337,10 +351,8 @@ async def serve(
         proxy_headers=False,
         limit_concurrency=CONNECTIONS_MAX,
         timeout_keep_alive=IDLE_TIMEOUT,
-        timeout_graceful_shutdown=SHUTDOWN_TIMEOUT,
     )
-    server = uvicorn.Server(config)
-    server.capture_signals = contextlib.nullcontext  # type: ignore[assignment]  # the command has its own
+    server = _Server(config)
     opened, url = listen_at(address, is_protected=tokens is not None)
     with opened:
         async with task_group() as tasks:
@@ -353,3 +365,4 @@ async def serve(
                     await stop.wait()
             finally:
                 server.should_exit = True
+                asyncio.get_running_loop().call_later(SHUTDOWN_TIMEOUT, server.disconnect)

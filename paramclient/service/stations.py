@@ -190,21 +190,17 @@ class GroundStation:
 
     def next_datagram(self) -> bytes:
         """Return the next frames, as many as fit in one datagram; empty if there are none."""
-        frames: list[bytes] = []
-        size = 0
-        while len(frames) < FRAMES_PER_DATAGRAM:
+        datagram, frames = b"", 0
+        while frames < FRAMES_PER_DATAGRAM:
             data, self._held = self._held or next(self._turns)() or next(self._turns)(), None
-            if data is None:
-                break
-            if frames and size + len(data) > DATAGRAM_SIZE:
+            if data is None or (frames and len(datagram) + len(data) > DATAGRAM_SIZE):
                 self._held = data
                 break
-            frames.append(data)
-            size += len(data)
+            datagram, frames = datagram + data, frames + 1
             self.endpoint.sending(data)
-        if len(frames) > 1:
-            self.endpoint.sending(b"".join(frames))
-        return b"".join(frames)
+        if frames > 1:
+            self.endpoint.sending(datagram)
+        return datagram
 
     async def send(self) -> None:
         """Send what is queued, until the scope is cancelled."""

@@ -174,9 +174,9 @@ class Served:
         """A new ground station; it is known from its first frame on."""
         return Partner(self.link, **options)
 
-    async def heard(self) -> Partner:
+    async def heard(self, **options: Any) -> Partner:
         """A new ground station, which has heard a vehicle."""
-        station = self.partner()
+        station = self.partner(**options)
         station.send(Heartbeat(6, 8))
         await until(lambda: station.frames)
         return station

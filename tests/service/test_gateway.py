@@ -647,8 +647,7 @@ async def test_rule_3_a_change_before_and_during_an_answer_is_in_it(is_begun: bo
 
 async def test_rule_4_a_set_is_a_verified_write_of_its_station() -> None:
     async with in_sync(small_px4()) as (served, vehicle, station):
-        other = served.partner(system=9)
-        other.send(GCS)
+        other = await served.heard(system=9)
         changes = (await served.clients[0].component()).changes()
         vehicle.received.clear()
         for _ in range(3):
@@ -681,8 +680,7 @@ async def test_rule_4_a_set_back_is_no_repetition() -> None:
 
 async def test_rule_4_an_error_goes_to_the_asker_alone_within_3_seconds() -> None:
     async with in_sync(small_px4()) as (served, vehicle, station):
-        other = served.partner(system=9)
-        other.send(GCS)
+        other = await served.heard(system=9)
         await station.ask(set_to("PARAM_01", 5, ParamType.INT16), seconds=0.1)
         assert station.of(messages.ParamError) == [messages.ParamError(255, 190, "PARAM_01", -1, 7)]
         await station.ask(ParamSet(1, 1, "PARAM_00", struct.pack("<f", math.nan), 9), seconds=0.1)
@@ -848,8 +846,7 @@ async def test_rule_6_telemetry_holds_no_list_up(seconds: float) -> None:
 @pytest.mark.parametrize("loss", [0.0, 0.2])
 async def test_rule_7_no_losses_but_those_of_the_radio(loss: float) -> None:
     async with gateway_over(Air.symmetric([PX4Vehicle()], loss=loss, seed=3)) as served:
-        station = served.partner()
-        station.send(GCS)
+        station = await served.heard()
         await served.synced()
         for _ in range(5):
             station.send(LIST)
@@ -1008,8 +1005,7 @@ async def test_rule_11_a_loop_ends() -> None:
     vehicle = Tap(small_px4())
     loop = Puppet(lambda message: (), heartbeat=None)
     async with gateway_over(PeersLink({"vehicle": vehicle, "loop": loop})) as served:
-        station = served.partner()
-        station.send(GCS)
+        station = await served.heard()
         await served.synced()
         for _ in range(5):
             for data in station.datagrams:
@@ -1046,8 +1042,7 @@ async def test_rule_11_a_vehicle_that_moves_is_no_copy_of_itself() -> None:
     vehicle = small_px4()
     link = PeersLink({"before": vehicle})
     async with gateway_over(link) as served:
-        station = served.partner()
-        station.send(GCS)
+        station = await served.heard()
         await served.synced()
         link.endpoints = {"after": vehicle}
         await anyio.sleep(12.0)

@@ -47,8 +47,13 @@ async def served(*words: str) -> AsyncIterator[tuple[asyncio.subprocess.Process,
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.asyncio
 async def test_a_signal_ends_it_with_streams_and_requests(tmp_path: Path, number: signal.Signals) -> None:
+    """Also with half a request, of which nothing is logged."""
     words = ("sim:px4", "--cache", str(tmp_path / "cache.sqlite3"))
-    async with served(*words) as (process, browser), anyio.create_task_group() as tasks:
+    async with (
+        served(*words) as (process, browser),
+        anyio.create_task_group() as tasks,
+        await anyio.connect_tcp("127.0.0.1", browser.base_url.port or 0) as half,
+    ):
         await synced(browser)
         await browser.put(f"{V}/params/MC_ROLL_P", json={"value": 7.5})
         answers = []
@@ -58,6 +63,7 @@ async def test_a_signal_ends_it_with_streams_and_requests(tmp_path: Path, number
             answers.append((await browser.put(f"{V}/params/MC_ROLL_P", json=body)).status_code)
 
         async with browser.stream("GET", "/api/events") as stream:
+            await half.send(b"POST /api/files HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9\r\n\r\n{")
             lines = stream.aiter_lines()
             assert (await anext(lines)).startswith("data: ")
             tasks.start_soon(wait)
