@@ -139,7 +139,7 @@ class Gateway:
         frame = seen.frame
         source = (frame.system, frame.component)
         is_vehicle = any(link.is_vehicle(source) for link in self.links)
-        if bears_key(seen.data) or is_vehicle or self.copies.has(seen.data, but_of=station):
+        if bears_key(seen.data) or is_vehicle or self.copies.returns_by(station, seen.data):
             return
         for link in self.links:
             link.avoid(frame.system)
@@ -251,7 +251,7 @@ class VehicleLink(Tap):
     def accepts(self, data: bytes, peer: Hashable) -> bool:
         """Return whether received data is no datagram of the gateway that has come back over another peer."""
         peers = (node.peer for node in self._station.nodes.values())
-        return not self._gateway.copies.has(data) or peer in peers
+        return self._gateway.copies.origin_of(hash(data)) is None or peer in peers
 
     def sent(self, frame: bytes) -> None:
         """Take note of a frame to the vehicles."""
@@ -301,12 +301,11 @@ class VehicleLink(Tap):
         node = self._station.nodes.get((frame.system, frame.component))
         if node is None or node.peer != peer:
             return None
-        plain = self._table(node, extended=False)  # from its first frame on, for its changes
-        extended = self._table(node, extended=True)
+        tables = [self._table(node, extended=each) for each in (False, True)]  # from its first frame on
         is_extended = frame.message_id in EXTENDED_ANSWERS
         is_for_us = _target_of(frame) == self._station.own_address[0]
         is_plain = frame.message_id in PLAIN_ANSWERS or (frame.message_id == FILE_TRANSFER and is_for_us)
-        table = extended if is_extended else plain
+        table = tables[is_extended]
         return table if (is_extended or is_plain) and table.withholds else None
 
     def _table(self, node: Node, *, extended: bool) -> KeptTable:
@@ -338,11 +337,17 @@ class _Copies:
         """Take note of a frame that is sent to vehicles, by a station or by the gateway."""
         self._note(hash(data), origin or self)
 
-    def has(self, data: bytes, *, but_of: Hashable = None) -> bool:
-        """Return whether these bytes were sent a moment ago, by another station that is still there."""
-        origin = self._origin(hash(data), but_of)
-        has_left = isinstance(origin, GroundStation) and origin.scope.cancel_called
-        return origin != but_of and not has_left
+    def returns_by(self, station: GroundStation, data: bytes) -> bool:
+        """Return whether these bytes were sent a moment ago by another one, and a station only returns them.
+
+        Programs with equal ids send equal frames, such as their first ones. In a loop, a station also brings
+        what the gateway has sent, or the frame of another station again and again.
+        """
+        origin, again = self.origin_of(hash(data), station), hash((data, station))
+        if origin != station and not station.is_loop:
+            station.is_loop = origin is self or self.origin_of(again) is not None
+            self._note(again, station)
+        return origin != station and station.is_loop
 
     def is_copy(self, data: bytes, origin: Hashable) -> bool:
         """Return whether a frame was sent to a station, or came from another origin, a moment ago.
@@ -350,15 +355,16 @@ class _Copies:
         Vehicles' frames are renumbered for each station, so that their numbers are not compared.
         """
         key = _key_of(data)
-        if self._origin(key, origin) != origin:
+        if self.origin_of(key, origin) != origin:
             return True  # and no note of it: a vehicle that has moved is heard again after a moment
         self._recent[key] = origin
         return False
 
     def _note(self, key: int, origin: Hashable) -> None:
-        self._recent.setdefault(key, self._origin(key, origin))
+        self._recent.setdefault(key, self.origin_of(key, origin))
 
-    def _origin(self, key: int, default: Hashable) -> Hashable:
+    def origin_of(self, key: int, default: Hashable = None) -> Hashable:
+        """Return what has sent a frame, or a datagram, with this key a moment ago."""
         now = anyio.current_time()
         if now - self._turned_at > LOOP_TIME:
             self._turned_at = now

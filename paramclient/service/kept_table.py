@@ -273,33 +273,32 @@ class KeptTable(Stream[Change]):
             self.send_list(station)
 
     def _stream(self, station: GroundStation, values: Iterable[ReportedValue], sent: set[int]) -> None:
-        now = (self.changes, self.component.node.generation)
-        station.stream((self, "list"), self.source, self._current(values, sent, *now))
-
-    def _current(
-        self, values: Iterable[ReportedValue], sent: set[int], changes: int, generation: int
-    ) -> Iterator[Message]:
-        """Yield the values of one list, each as it is by then, until the component is lost or restarts.
+        """Send the values of one list, each as it is by then, until the component is lost or restarts.
 
         A heartbeat precedes the first one: a station may ask before it has heard one, and MAVProxy does not
         decode a PX4's integers then, although it would hear one while the vehicle itself answers.
 
         Args:
-            values: of the list, as they were after so many changes.
-            sent: takes the index of each yielded value.
-            changes, generation: of the table and the component when the list was made.
+            station: to which they go.
+            values: of the list, as they are now.
+            sent: takes the index of each value.
         """
-        for value in values:
-            if self.is_lost or self.component.node.generation != generation:
-                return
-            if not sent and self.heartbeat is not None:
-                yield self.heartbeat
-            param = self.session.table.params.get(value.param_id)
-            if self.changes != changes and param is not None:
-                now = value_of(self.session, param, index=value.param_index)
-                value = now._replace(param_count=value.param_count)
-            sent.add(value.param_index)
-            yield value
+        changes, generation = self.changes, self.component.node.generation
+
+        def current() -> Iterator[Message]:
+            for value in values:
+                if self.is_lost or self.component.node.generation != generation:
+                    return
+                if not sent and self.heartbeat is not None:
+                    yield self.heartbeat
+                param = self.session.table.params.get(value.param_id)
+                if self.changes != changes and param is not None:
+                    now = value_of(self.session, param, index=value.param_index)
+                    value = now._replace(param_count=value.param_count)
+                sent.add(value.param_index)
+                yield value
+
+        station.stream((self, "list"), self.source, current())
 
     def load(self) -> anyio.Event:
         """Fetch the table, unless that is in progress; return the event of its end."""

@@ -113,6 +113,7 @@ class GroundStation:
         version: of MAVLink, of the answers: 1 only for a station that has sent version 1 and never 2.
         requests: of parameters, by kind.
         list_asked_at: when it last asked for a list of which no table was known.
+        is_loop: whether it returns what others have sent.
         waiting: requests that wait.
         files: that it has open over MAVFTP, by session.
         reading, writing: limit its reads and sets in progress, so that no station holds others up.
@@ -129,6 +130,7 @@ class GroundStation:
         self.version = 2
         self.requests: Counter[str] = Counter()
         self.list_asked_at = -math.inf
+        self.is_loop = False
         self.waiting = 0
         self.files: dict[tuple[Hashable, ...], Any] = {}
         self.reading = anyio.CapacityLimiter(READS_AT_ONCE)

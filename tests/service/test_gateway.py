@@ -135,16 +135,11 @@ async def test_rule_1_stations_with_equal_ids_send_equal_frames() -> None:
         for each in stations:
             assert len(each.of(ParamValue)) == 26
             assert len(each.of(messages.ParamError)) == 1
-        assert len(vehicle.messages(messages.CommandLong)) == 1  # the others are equal, and arrive at once
-        for _ in range(2):
-            same = messages.encode(messages.CommandLong(1, 1, 401), system=255, component=190, sequence=0)
-            station.send_bytes(same)
+        same = messages.encode(messages.CommandLong(1, 1, 401), system=255, component=190, sequence=0)
+        for each in (station, station, served.partner(), served.partner()):  # a program started anew
+            each.send_bytes(same)
             await anyio.sleep(0.5)
-        assert len(vehicle.messages(messages.CommandLong)) == 3
-        for each in (station, served.partner()):  # a program that has ended, and one that is started then
-            each.send_bytes(b"" if each is station else same)
-            await anyio.sleep(0.5)
-        assert len(vehicle.messages(messages.CommandLong)) == 4
+        assert [each.command for each in vehicle.messages(messages.CommandLong)] == [400] * 3 + [401] * 4
 
 
 async def test_rule_1_a_list_at_the_first_heartbeat_stays_off_the_radio() -> None:
@@ -793,8 +788,7 @@ async def test_rule_6_queues_are_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(stations, "STATION_QUEUE_MAX", 10)
     monkeypatch.setattr(stations, "STREAMS_PER_STATION_MAX", 5)
     async with gateway_over(small_px4()) as served:
-        station = served.partner()
-        await station.ask(GCS)
+        station = await served.heard()
         for station.address in [(system, 190) for system in range(100, 200)]:
             station.send(GCS)
         served.link.is_stuck = True
@@ -1012,11 +1006,10 @@ async def test_rule_11_a_loop_ends() -> None:
                 loop.say_bytes(data)
             await station.ask(seconds=1.0)
             assert len(station.frames) <= 3
-        before = len(station.frames)
-        own = frames.build_frame(0, bytes(9), system=1, component=1, sequence=1)
-        station.send_bytes(own)  # of a vehicle that is kept
-        await anyio.sleep(0.2)
-        assert len(station.frames) - before <= 2
+        # of a vehicle that is kept
+        station.send_bytes(frames.build_frame(0, bytes(9), system=1, component=1, sequence=1))
+        await station.ask(seconds=0.2)
+        assert len(station.frames) <= 2
         assert 1 not in {frame.system for _, frame, _ in vehicle.received}
         vehicle.received.clear()
         assert await listed(station) == 26
@@ -1024,6 +1017,21 @@ async def test_rule_11_a_loop_ends() -> None:
         loop.say_bytes(b"".join(station.datagrams * 2))  # as a router may pack them
         await station.ask()
         assert not station.of(ParamValue)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 2.0])
+async def test_rule_11_what_a_station_sends_ends_where_another_one_returns_it(seconds: float) -> None:
+    """The vehicle link leads to the endpoint, which knows it when the gateway's own frames come."""
+    link = PeersLink({"vehicle": (vehicle := Tap(small_px4()))})
+    async with gateway_over(link) as served:
+        station = await served.heard()
+        link.endpoints["loop"] = served.as_vehicles()
+        await anyio.sleep(seconds)
+        for command in range(400, 405):
+            await station.ask(messages.CommandLong(1, 1, command), seconds=1.0)
+            assert len(station.frames) <= 4
+        sent = [each.command for each in vehicle.messages(messages.CommandLong) if each.command < 405]
+        assert sent == [400] * (1 if seconds else 2) + [401, 402, 403, 404]
 
 
 async def test_rule_11_neither_an_echo_of_the_radio_nor_a_key_reaches_a_station() -> None:
