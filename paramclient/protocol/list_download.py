@@ -69,7 +69,7 @@ class ListResult:
         lost: values of the list that were lost, and read one by one or by another list.
         repeated: values received more than once.
         digest: PX4's, which begins its list; it is of the table at that moment.
-        has_gap: whether values between the first and the last received one are missing, and reads of them
+        has_gap: whether values are missing that were sent: some of the list were lost, and reads of them
             would not have been answered.
     """
 
@@ -187,7 +187,8 @@ class _Download:
             self.table.end_list()
         self.result.missing = missing = self._missing()
         if is_silent or not serves_reads:
-            self.result.has_gap = any(min(self._received) < each < self._reached for each in missing)
+            first = min(self._received)
+            self.result.has_gap = any(has_loss or first < each < self._reached for each in missing)
         self.result.lost = len(self._lost & {*self._received, *missing})
 
     async def _take_passes(self) -> None:
@@ -282,7 +283,7 @@ class _Download:
                 await channel.exchange(
                     request, inbox, accept, what=what, attempts=attempts_max, copies=copies
                 )
-                if self.reads_beside or not channel.is_streaming:  # else it may be of a list that runs again
+                if not self._may_begin_again():  # else it may be of a list that runs again
                     self.session.serves_reads[int] = True
             except NoReply as error:
                 attempts = error.attempts if error.attempts < most else ATTEMPTS_MAX

@@ -298,7 +298,8 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
         tasks.start_soon(take)
         with suppress(NoReply):
             for _ in range(1 + session.listing.is_running):  # one that runs may have passed the parameter
-                has_gap = (await session.listing.join(lambda: download_list(session))).has_gap
+                listed = await session.listing.join(lambda: download_list(session))
+                has_gap = listed.has_gap or (bool(listed.missing) and which in session.table.params)
         tasks.cancel_scope.cancel()
     if answers or has_gap is not None:
         session.serves_reads.setdefault(type(which), False)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
+from weakref import WeakValueDictionary
 
 import anyio
 
@@ -194,7 +195,7 @@ class Session:
         self.acknowledging: set[str] = set()
         self.observers: set[Callable[[int, int | None], None]] = set()
         self._identified = identified
-        self._locks: dict[str, anyio.Lock] = {}
+        self._locks: WeakValueDictionary[str, anyio.Lock] = WeakValueDictionary()
         self._foreign_sets: dict[str, tuple[str, float]] = {}
         self._sequences: dict[str, int] = {}  # of the frame with each value
 
@@ -306,8 +307,6 @@ class Session:
 
     def lock(self, name: str) -> anyio.Lock:
         """Return the lock of the writes to one name: they run one after the other."""
-        if len(self._locks) > 2 * len(self.table.params) + 16:
-            self._locks = {each: lock for each, lock in self._locks.items() if lock.locked()}
         return self._locks.setdefault(name, anyio.Lock())
 
     def announce(self, digest: Digest) -> None:

@@ -448,7 +448,8 @@ async def _read_writable(session: Session, name: str) -> Param:
     param = await _known(session, name)
     is_integer = isinstance(param.type, ParamType) and param.type.is_integer
     if is_integer and session.identification.chosen is None:
-        if not session.table.evidence:  # 0 is the same in both, and files have no encoding
+        # 0 is the same in both, and files have no encoding; a list alone has shown all that there is.
+        if not session.table.evidence and session.serves_reads.get(int) is not False:
             await session.seeking.join(lambda: _seek_evidence(session))
         if doubt := session.encoding_doubt:
             raise UsageError(f"{name} was not written. {doubt}")

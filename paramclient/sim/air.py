@@ -226,8 +226,7 @@ class Air:
                 for data in vehicle.data_to_send():
                     self.downlink.send(data, now)
                 due[place] = _at(vehicle)
-        arrived = self.downlink.deliver(now)
-        self._out += arrived[: OUT_LIMIT - len(self._out)]
+        self._out += self.downlink.deliver(now)[: OUT_LIMIT - len(self._out)]
 
 
 _HELD_BACK = 0.03

@@ -20,24 +20,13 @@ import pytest
 from paramclient import Component, ParamClient
 from paramclient.sim import Air, PX4Vehicle
 from paramclient.wire import messages
+from tests import shell
 from tests.caches import set_aside
 from tests.client.conftest import fetched, table_in
-from tests.shell import (
-    VALUES,
-    a_client,
-    bits,
-    generic,
-    residue,
-    settled,
-    simulated_time_loop,
-    small_px4,
-    tasks_beside,
-    until,
-)
 
 Call = Callable[[ParamClient, Component], Coroutine[Any, Any, object]]
 
-FEW_VALUES = {name: VALUES[name] for name in list(VALUES)[:8]}
+FEW_VALUES = {name: shell.VALUES[name] for name in list(shell.VALUES)[:8]}
 fresh = count(1000)
 
 POINTS_MAX = 1000
@@ -78,24 +67,24 @@ def seen(progress: object) -> None:
 @asynccontextmanager
 async def a_session() -> AsyncIterator[tuple[ParamClient, Component]]:
     """A client that has just found a vehicle with a camera; another one is found a little later."""
-    late = generic(system=2, table=FEW_VALUES)
-    late.reboot(simulated_time_loop().time(), down=0.03)
-    camera = generic(component=100, table=FEW_VALUES, autopilot=messages.MAV_AUTOPILOT_INVALID)
+    late = shell.generic(system=2, table=FEW_VALUES)
+    late.reboot(shell.simulated_time_loop().time(), down=0.03)
+    camera = shell.generic(component=100, table=FEW_VALUES, autopilot=messages.MAV_AUTOPILOT_INVALID)
     vehicle = PX4Vehicle(table={**FEW_VALUES, "CAL_ACC0_XOFF": 0.5}, burst=3)
-    async with a_client(Air.symmetric([vehicle, camera, late], delay=0.004)) as client:
+    async with shell.a_client(Air.symmetric([vehicle, camera, late], delay=0.004)) as client:
         yield client, await client.component()
 
 
 def is_idle(client: ParamClient) -> bool:
     """Whether nothing is registered in any component."""
-    return not any(residue(each) for each in client.components.values())
+    return not any(shell.residue(each) for each in client.components.values())
 
 
 async def check_after(call: Call, client: ParamClient, component: Component) -> None:
     """A call was cancelled: nothing is left, and it can be made again."""
     assert is_idle(client)
     await call(client, component)
-    await settled()
+    await shell.settled()
     assert is_idle(client)
     await asyncio.sleep(0.5)
     assert is_idle(client)
@@ -104,10 +93,10 @@ async def check_after(call: Call, client: ParamClient, component: Component) -> 
 @EVERY_CALL
 @pytest.mark.parametrize("how", ["task", "scope"])
 async def test_cancelled_at_each_point(call: Call, how: str) -> None:
-    loop = simulated_time_loop()
+    loop = shell.simulated_time_loop()
     for number in range(1, POINTS_MAX):
         async with a_session() as (client, component):
-            before, scope = tasks_beside(), anyio.CancelScope()
+            before, scope = shell.tasks_beside(), anyio.CancelScope()
 
             async def scoped() -> None:
                 with scope:  # noqa: B023 - it has ended before the next one is made
@@ -120,10 +109,10 @@ async def test_cancelled_at_each_point(call: Call, how: str) -> None:
             # a task that goes on already leaves its scope without another look at it
             was_cancelled = task.cancelled() or scope.cancelled_caught
             assert was_cancelled == is_struck or (how == "scope" and not was_cancelled)
-            await settled()
-            assert tasks_beside() == before
+            await shell.settled()
+            assert shell.tasks_beside() == before
             await check_after(call, client, component)
-        assert not tasks_beside()
+        assert not shell.tasks_beside()
         if not is_struck:
             break
     assert 1 < number < POINTS_MAX - 1
@@ -131,8 +120,8 @@ async def test_cancelled_at_each_point(call: Call, how: str) -> None:
 
 async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path) -> None:
     path = tmp_path / "cache"
-    vehicle = small_px4()
-    loop = simulated_time_loop()
+    vehicle = shell.small_px4()
+    loop = shell.simulated_time_loop()
 
     async def session() -> None:
         async with fetched(vehicle, cache=path) as (_, component):
@@ -144,13 +133,13 @@ async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path) -> None:
         loop.run_between_rounds(task, task.cancel, after=number)
         await asyncio.wait([task])
         assert task.cancelled() == loop.has_run_action
-        await settled()
-        assert not tasks_beside()
-        await until(lambda: not any(each.name == "paramclient cache" for each in threading.enumerate()))
+        await shell.settled()
+        assert not shell.tasks_beside()
+        await shell.until(lambda: not any(each.name == "paramclient cache" for each in threading.enumerate()))
         if not loop.has_run_action:
             break
     assert 5 < number < POINTS_MAX - 1
     cached = table_in(path)
-    assert bits(cached.params) == bits(vehicle.params)
+    assert shell.bits(cached.params) == shell.bits(vehicle.params)
     assert cached.hash == vehicle.announced_hash()
     assert not set_aside(path)

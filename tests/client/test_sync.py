@@ -26,15 +26,7 @@ from paramclient import (
 )
 from paramclient.model.values import Value
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
-from paramclient.wire.messages import (
-    HASH_CHECK,
-    AutopilotVersion,
-    Heartbeat,
-    ParamRequestList,
-    ParamRequestRead,
-    ParamSet,
-    encode,
-)
+from paramclient.wire import messages
 from tests.client.conftest import connected, fetched, table_in
 from tests.conversations.test_fetch import new_vehicle
 from tests.conversations.test_writes import free_names
@@ -56,7 +48,7 @@ from tests.shell import (
 
 VOLATILE = {"CAL_ACC0_XOFF", "PARAM_03"}
 TIME_MAX = 7.0
-MISSES = (ParamRequestRead, ParamRequestList, ParamSet)
+MISSES = (messages.ParamRequestRead, messages.ParamRequestList, messages.ParamSet)
 
 
 async def drained(events: Events) -> list[Event]:
@@ -79,7 +71,7 @@ def requested(tap: Tap) -> int:
 
 
 def hashes(tap: Tap) -> int:
-    return sum(each.param_id == HASH_CHECK for each in tap.messages(ParamRequestRead))
+    return sum(each.param_id == messages.HASH_CHECK for each in tap.messages(messages.ParamRequestRead))
 
 
 async def away(tap: Tap, seconds: float) -> None:
@@ -121,10 +113,10 @@ async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
         await asyncio.sleep(1.0)
         px4.received.clear()
         await asyncio.sleep(100.0)
-        reads = [each.param_id for each in px4.messages(ParamRequestRead)]
-        assert reads.count(HASH_CHECK) == 3
+        reads = [each.param_id for each in px4.messages(messages.ParamRequestRead)]
+        assert reads.count(messages.HASH_CHECK) == 3
         assert len(reads) == 3
-        assert not px4.messages(ParamRequestList), "nor one for the other vehicle"
+        assert not px4.messages(messages.ParamRequestList), "nor one for the other vehicle"
 
 
 @pytest.mark.parametrize("ftp", [True, False])
@@ -206,7 +198,7 @@ async def test_a_list_for_another_station_is_taken_and_restarts_nothing() -> Non
     async with fetched(tap, watch_interval=0) as (_, component):
         vehicle.load({"PARAM_01": 1001})
         before = requested(tap)
-        request = encode(ParamRequestList(1, 1), system=254, component=190, sequence=0)
+        request = messages.encode(messages.ParamRequestList(1, 1), system=254, component=190, sequence=0)
         vehicle.receive(request, anyio.current_time())
         await anyio.sleep(100.0)
         assert requested(tap) == before
@@ -240,7 +232,7 @@ async def test_lost_and_found() -> None:
             await component.get("PARAM_01")
         tap.received.clear()
         await anyio.sleep(60.0)
-        assert len(tap.received) == len(tap.messages(Heartbeat)) == 60
+        assert len(tap.received) == len(tap.messages(messages.Heartbeat)) == 60
         tap.is_mute = tap.is_deaf = False
         with anyio.fail_after(2.0):
             found = await anext(events)
@@ -282,7 +274,7 @@ async def test_a_hash_that_is_lost_several_times_is_no_reason_for_a_download() -
         tap.is_deaf = False
         await asyncio.sleep(15.0)
         assert component.sync_state is SyncState.SYNCED
-        assert not tap.messages(ParamRequestList)
+        assert not tap.messages(messages.ParamRequestList)
 
 
 async def test_a_watch_survives_a_link_that_drops_during_a_check() -> None:
@@ -322,7 +314,7 @@ async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, a
         stranger = small_px4(uid=2)
         stranger.set_param("PARAM_01", 1001)
         filters = [
-            Filter(each, down=lambda message: not isinstance(message, AutopilotVersion))
+            Filter(each, down=lambda message: not isinstance(message, messages.AutopilotVersion))
             for each in (stranger, generic(component=100, uid=2, table={"PARAM_01": 1001}))
         ]
         berth.endpoint, camera.endpoint = filters

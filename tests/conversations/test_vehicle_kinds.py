@@ -234,8 +234,11 @@ async def test_an_unknown_name_beside_a_fetch_costs_no_list_of_its_own() -> None
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
 
 
-async def test_values_of_a_repeated_list_are_no_answers_to_reads_by_index() -> None:
-    vehicle = Partial(serves=("list", "sets", "acks"))
+@pytest.mark.parametrize("heartbeat", [QUIET, PX4], ids=["generic", "PX4"])
+async def test_values_of_a_repeated_list_are_no_answers_to_reads_by_index(
+    heartbeat: messages.Heartbeat,
+) -> None:
+    vehicle = Partial(serves=("list", "sets", "acks"), heartbeat=heartbeat)
 
     def down(message: messages.Message) -> bool:
         lost_in = {"MODE": 3, "OFFSET": 1}.get(getattr(message, "param_id", ""), -1)
@@ -243,6 +246,16 @@ async def test_values_of_a_repeated_list_are_no_answers_to_reads_by_index() -> N
 
     async with talking(Air.symmetric([Tap(vehicle, down=down)], delay=0.15)) as (_, session):
         assert (await write(session, "MODE", 4)).status == "accepted"
+
+
+async def test_a_known_parameter_that_a_list_lost_is_not_unknown() -> None:
+    lost: set[str] = set()
+    vehicle = Tap(Partial(serves=("list",)), down=lambda message: getattr(message, "param_id", 0) not in lost)
+    async with talking(Air.symmetric([vehicle])) as (_, session):
+        await read(session, "NODE_ID")
+        lost.add("NODE_ID")
+        with pytest.raises(errors.NoReply):
+            await read(session, "NODE_ID")
 
 
 @pytest.mark.parametrize("heartbeat", [ARDUPILOT, QUIET, PX4], ids=["AP", "generic", "PX4"])
