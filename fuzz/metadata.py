@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
-from paramclient.metadata import read_content
+from paramclient.metadata.store import read_content
 
 __all__ = ["INPUT_SIZE_MAX", "run"]
 

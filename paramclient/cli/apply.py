@@ -27,11 +27,10 @@ from paramclient.cli.sources import described, filled, is_pattern_name, not_a_fi
 from paramclient.files import FileFormat, ParamFile
 from paramclient.model.names import age_in_words, is_pattern
 from paramclient.model.paramset import ParamSet
-from paramclient.provision import apply_restore
+from paramclient.provision import apply_restore, execution
 from paramclient.provision.apply_rules import CATEGORIES, READ_ONLY
 from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
-from paramclient.provision.execution import run as run_apply
-from paramclient.provision.inspection import plan, wait_for_identity
+from paramclient.provision.inspection import plan, plan_for, wait_for_identity
 from paramclient.provision.planning import ApplyRow, ApplyStatus, Plan, Rows
 from paramclient.provision.sources import NO_DEFAULTS, choose, is_file, read_source
 
@@ -277,23 +276,26 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
             hint = "--no-cache does without, and restore then needs a backup file"
             raise errors.CacheError(f"nothing was sent: {failure}; {hint}") from failure
     async with sessions(url, flags, writes=True) as found:
-        jobs, backups = dict[CommandSession, _Job](), set[str]()
+        jobs, given = dict[CommandSession, _Job](), set[object]()
 
         async def prepare(session: CommandSession) -> None:
             await wait_for_identity(session.component)
-            backup = None
-            if flags.backup is not None:
-                backup = filled(flags.backup, session.component, session.label)
-                if await anyio.Path(backup).exists() or backup in backups:
-                    problem = "exists already, or is another vehicle's; a name may have {uid} or {system}"
-                    raise errors.FileError(problem, source=backup)
-                backups.add(backup)
+            backup = None if flags.backup is None else filled(flags.backup, session.component, session.label)
+            if backup is not None and (await anyio.Path(backup).exists() or backup in given):
+                problem = "exists already, or is another vehicle's; a name may have {uid} or {system}"
+                raise errors.FileError(problem, source=backup)
+            given.add(backup)
             state, include = await load(session), flags.include
             if state.is_restore:
                 say(f"{session.prefix}the state: {described(state.params)}")
                 include += await apply_restore.restore_categories(session.component, state.params)
             info = await known_of_session(session, metadata)
             options = ApplyOptions(include=include, info=info, partial=state.partial, backup=backup)
+            system = plan_for(session.component, state.params, None, options).system_id
+            if system is not None and system in given:
+                problem = f"other vehicles would get the system id {system!r} too; a name may have {{system}}"
+                raise errors.FileError(problem, source=state.params.source)
+            given.add(system)
             options |= {"reboot": flags.reboot, "allow_armed": flags.allow_armed}
             jobs[session] = _Job(session, state, options)
 
@@ -371,7 +373,7 @@ class _Job:
         options = self.options | {"timeout": session.deadline.left(), "progress": update}
         options["before_writing"] = session.check_only
         with Status(f"{title}: waiting for the first response", title) as status:
-            run = run_apply(session.component, state.params, options, is_restore=state.is_restore)
+            run = execution.run(session.component, state.params, options, is_restore=state.is_restore)
             try:
                 self.found = await run
             except errors.InvalidParameters:

@@ -69,8 +69,7 @@ async def fetch(
             item = fetch_json(session.component, result, params, known) | _errors_json(errors)
             return _Shown(item, columns, partial(_report_fetch, session, result, errors.values()))
 
-        done = await found.work(work)
-    return found.show(done)
+        return found.show(await found.work(work))
 
 
 async def get(
@@ -102,8 +101,7 @@ async def get(
             missing = session.component.session.table.missing() if any(map(is_pattern, chosen)) else []
             return _Shown(item, columns, partial(_report_get, session, errors.values(), missing))
 
-        done = await found.work(work)
-    return found.show(done)
+        return found.show(await found.work(work))
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,14 +10,7 @@ The metadata is optional. It comes from a file (`read_metadata`) or from the veh
 
 from paramclient.metadata.download import metadata_of
 from paramclient.metadata.info import Metadata, ParamInfo
-from paramclient.metadata.store import (
-    AddedFiles,
-    AddedMetadata,
-    MetadataStore,
-    VehicleKind,
-    read_content,
-    read_metadata,
-)
+from paramclient.metadata.store import AddedFiles, AddedMetadata, MetadataStore, VehicleKind, read_metadata
 
 __all__ = [
     "AddedFiles",
@@ -27,6 +20,5 @@ __all__ = [
     "ParamInfo",
     "VehicleKind",
     "metadata_of",
-    "read_content",
     "read_metadata",
 ]

@@ -18,16 +18,7 @@ from paramclient.provision.apply_restore import FleetResult, apply, for_each, re
 from paramclient.provision.apply_rules import CATEGORIES
 from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
 from paramclient.provision.inspection import plan
-from paramclient.provision.planning import (
-    MISSING,
-    WRONG,
-    ApplyRow,
-    ApplyStatus,
-    Plan,
-    PlanOptions,
-    Stage,
-    plan_from,
-)
+from paramclient.provision.planning import MISSING, WRONG, ApplyRow, ApplyStatus, Plan, PlanOptions, plan_from
 from paramclient.provision.sources import resolve
 
 __all__ = [
@@ -41,7 +32,6 @@ __all__ = [
     "MISSING",
     "Plan",
     "PlanOptions",
-    "Stage",
     "WRONG",
     "apply",
     "for_each",

@@ -31,8 +31,8 @@ from paramclient.files import write_file
 from paramclient.model.paramset import ParamSet
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision.apply_rules import READ_ONLY, ApplyRules, rules_for
-from paramclient.provision.inspection import Inspection, inspect, plan_for, reread, wait_for_identity
-from paramclient.provision.planning import WRONG, ApplyRow, ApplyStatus, Plan, PlanOptions, Rows, Stage
+from paramclient.provision.inspection import Inspection, claims, inspect, plan_for, reread, wait_for_identity
+from paramclient.provision.planning import ApplyRow, ApplyStatus, Plan, PlanOptions, Rows, Stage, check_keys
 
 BEFORE_APPLY: Final = "before apply"
 """The reason of the snapshot that `apply` stores before its first write."""
@@ -150,21 +150,22 @@ async def run(
         is_restore: whether they are an earlier state of the vehicle. A parameter that it refuses as read-only
             is then skipped, and not reported as refused.
     """
-    if unknown := sorted(options.keys() - ApplyOptions.__annotations__.keys()):
-        raise TypeError(f"apply and restore have no option {unknown[0]!r}; see ApplyOptions, and plan")
+    check_keys(options, ApplyOptions)
     began = anyio.current_time()
     error: ParamClientError | None = None
     one = _Run(component, wanted, options, is_restore=is_restore)
-    with anyio.move_on_after(options.get("timeout")) as scope:
-        await one.begin()
-        try:
+    try:
+        with anyio.move_on_after(options.get("timeout")) as scope:
+            await one.begin()
             with component.watch.held():  # a changed count starts no download besides those of the run
                 await one.store_state()
                 await one.write_and_verify()
-        except ParamClientError as failure:
-            if not one.sent:
-                raise
-            error = failure
+    except ParamClientError as failure:
+        if not one.sent:
+            raise
+        error = failure
+    finally:
+        claims.pop(component, None)
     waited = anyio.current_time() - began
     if scope.cancelled_caught:
         error = NoReply(f"the apply to {component.system}/{component.component}", attempts=0, waited=waited)
@@ -189,9 +190,6 @@ class _Run:
             raise UsageError(f"nothing was sent: the backup file {backup} exists already")
         self.component, self.wanted, self.options = component, wanted, options
         self.is_restore, self._reboots_allowed = is_restore, options.get("reboot", False)
-        self._planned = PlanOptions(
-            include=options.get("include", ()), info=options.get("info"), force=options.get("force", False)
-        )
         self.sent: set[str] = set()
         self._before: ParamSet | None = None  # the state before the first write
         self._snapshot: int | None = None  # its number in the cache
@@ -211,13 +209,13 @@ class _Run:
         component = self.component
         if self.options.get("durable") and component.core.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
-        plan_for(component, self.wanted, None, self._planned)  # errors before the vehicle is read
+        plan_for(component, self.wanted, None, self.options)  # errors before the vehicle is read
         await wait_for_identity(component)
         self._identity = component.identity
         with component.watch.held():
             await self._check_armed()
             await self._inspect()
-        self._first_plan = self._plan
+        self._first_plan, claims[component] = self._plan, self._plan.system_id
         if self._plan.problems and not self.options.get("partial"):
             raise InvalidParameters(self._plan.problems)
         if self.is_restore:
@@ -330,7 +328,7 @@ class _Run:
 
     async def _inspect(self) -> None:
         absent = frozenset[str]() if self._before is None else self._inspection.absent
-        await self._read(inspect(self.component, self.wanted, absent), verifies=True)
+        await self._read(partial(inspect, self.component, self.wanted, absent), verifies=True)
 
     async def _verify(self) -> None:
         """Read the wanted parameters: by name if that is faster than the whole table, else the table.
@@ -341,7 +339,8 @@ class _Run:
         if self._plan.of(ApplyStatus.LATER) or not self._inspection.is_reading_faster(len(names)):
             await self._inspect()
         else:
-            await self._read(reread(self.component, self._inspection, names, names), verifies=True)
+            read = partial(reread, self.component, self._inspection, names, names)
+            await self._read(read, verifies=True)
 
     async def _read_revealed(self, done: Stage) -> None:
         """Read by name the parameters that a stage may have revealed. This verifies no write."""
@@ -349,15 +348,15 @@ class _Run:
         if self.component.autopilot == "ardupilot":  # a switch reveals the names with its own prefix
             groups = tuple(row.name.rpartition("_")[0] for row in done.rows)
             names = [name for name in names if name.startswith(groups)]
-        await self._read(reread(self.component, self._inspection, names))
+        await self._read(partial(reread, self.component, self._inspection, names))
 
-    async def _read(self, reading: Awaitable[Inspection], *, verifies: bool = False) -> None:
-        """Await a read of the vehicle, and plan again from it."""
+    async def _read(self, read: Callable[[], Awaitable[Inspection]], *, verifies: bool = False) -> None:
+        """Read the vehicle, and plan again from that."""
         self._report("reading")
         began = anyio.current_time()
-        self._inspection = await reading
+        self._inspection = await read()
         self._check_same_vehicle()
-        self._plan = plan_for(self.component, self.wanted, self._inspection, self._planned)
+        self._plan = plan_for(self.component, self.wanted, self._inspection, self.options)
         if verifies:
             self._inspected_at = began
 
@@ -423,13 +422,11 @@ class _Run:
 
     async def _write_system_id(self, row: ApplyRow) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
-        component, own, system = self.component, self.component.identity, int(row.wanted.value)
-        for known in component.client.components.values():
-            is_ours = own.has_own_uid and known.identity.uid == own.uid  # under an earlier id
-            is_there = known.system == system != component.system and known.state != "lost"
-            if is_there and not is_ours:
-                self._settle(row, ApplyStatus.REFUSED, f"another vehicle on this link has id {system}", WRONG)
-                return
+        component, system = self.component, int(row.wanted.value)
+        now = plan_for(component, self.wanted, self._inspection, self.options).rows[row.name]
+        if now.status is ApplyStatus.REFUSED:  # another vehicle has appeared
+            self._settle(row, now.status, now.reason, now.category)
+            return
         if row.needs_reboot:
             await self._write([row])
             return
@@ -444,12 +441,10 @@ class _Run:
             self.component = await component.client.successor(
                 component, system, timeout=SYSTEM_CHANGE_TIMEOUT
             )
-        except Refused as error:
-            self._settle(row, ApplyStatus.REFUSED, str(error))
-            return
-        except NoReply as error:
+        except (NoReply, Refused) as error:
             if not is_acknowledged:
-                self._settle(row, ApplyStatus.UNKNOWN, str(error))
+                is_refused = isinstance(error, Refused)
+                self._settle(row, ApplyStatus.REFUSED if is_refused else ApplyStatus.UNKNOWN, str(error))
                 return
         finally:
             self._written_at = anyio.current_time()

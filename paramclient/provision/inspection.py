@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Collection, Container, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, Unpack
+from weakref import WeakKeyDictionary
 
 import anyio
 
 from paramclient.client.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.paramset import AnyParams, ParamSet, set_of
-from paramclient.model.values import Param, ParamType, Trust
-from paramclient.provision.planning import Plan, PlanOptions, plan_from
+from paramclient.model.values import Param, ParamType, Trust, Value
+from paramclient.provision.planning import Plan, Planner, PlanOptions, check_keys
 from paramclient.provision.sources import component_set, part_set
 
 READS_IN_PROGRESS_MAX: Final = 64
@@ -26,6 +28,8 @@ READ_INTERVAL: Final = 0.025
 """Seconds for one of many reads on a fast link: ArduPilot answers 49 per second (measured)."""
 READ_SIZE_RATIO: Final = 6.0
 """Bytes of a read and its response, 73, over those of one parameter in ArduPilot's file, 13 (measured)."""
+claims: Final = WeakKeyDictionary[Component, Value | None]()
+"""The system ids that running calls of `apply` set, by vehicle."""
 
 
 async def plan(component: Component, wanted: AnyParams, **options: Unpack[PlanOptions]) -> Plan:
@@ -43,6 +47,7 @@ async def plan(component: Component, wanted: AnyParams, **options: Unpack[PlanOp
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
+    check_keys(options, PlanOptions)
     wanted = set_of(wanted, is_extended=component.is_extended)
     plan_for(component, wanted, None, options)
     await wait_for_identity(component)
@@ -51,13 +56,26 @@ async def plan(component: Component, wanted: AnyParams, **options: Unpack[PlanOp
 
 def plan_for(component: Component, wanted: ParamSet, found: Inspection | None, options: PlanOptions) -> Plan:
     """Return the plan for a vehicle; before it is read, only the errors of `plan_from` matter."""
-    return plan_from(
-        component_set(component, (), "") if found is None else found.table,
-        wanted,
-        autopilot=component.autopilot,
-        encoding=component.encoding,
-        **options,
-    )
+    table = component_set(component, (), "") if found is None else found.table
+    is_in_use, kind = partial(_is_system_in_use, component), component.autopilot
+    return Planner(table, wanted, kind, component.encoding, options, is_in_use).plan()
+
+
+def _is_system_in_use(component: Component, name: str, system: Value) -> bool:
+    """Return whether another vehicle on the link has a system id, or gets it.
+
+    It gets the id that its table has, at its next start, or that a running `apply` sets.
+
+    Args:
+        component: a component of the vehicle.
+        name: the parameter with the system id.
+        system: the id.
+    """
+    own, known = component.identity, component.client.components.values()
+    others = [each for each in known if each.vehicle is not component.vehicle and each.state != "lost"]
+    others = [each for each in others if not own.has_own_uid or each.identity.uid != own.uid]
+    held = [param.settable for each in others if (param := each.params.get(name)) is not None]
+    return system in [*held, *(each.system for each in others), *map(claims.get, others)]
 
 
 async def wait_for_identity(component: Component) -> None:

@@ -19,7 +19,7 @@ from paramclient.model.comparison import same_value
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite, version_difference
 from paramclient.model.names import is_group_switch, nearest_names
 from paramclient.model.paramset import AnyParams, ParamSet, WrittenParam, set_of
-from paramclient.model.values import Encoding, Param, ParamType, Value, format_value
+from paramclient.model.values import Encoding, ParamType, Value, format_value
 from paramclient.protocol.dialect import EXTENDED, PLAIN
 from paramclient.provision.apply_rules import ACTION, OUT_OF_RANGE, READ_ONLY, Choice, rules_for
 
@@ -204,6 +204,7 @@ class Plan(Rows):
         firmware: the identities of the file and of the vehicle, if both are known; else ().
         awaiting_reboot: switches that are on and whose group is missing: they take effect after a reboot,
             and the vehicle may not have rebooted since they were set.
+        system_id: the wanted system id; None without one, or if it is left out.
     """
 
     stages: tuple[Stage, ...]
@@ -212,6 +213,7 @@ class Plan(Rows):
     unchecked: tuple[str, ...] = ()
     firmware: tuple[Identity, ...] = ()
     awaiting_reboot: tuple[str, ...] = ()
+    system_id: Value | None = None
 
     @property
     def firmware_note(self) -> str:
@@ -249,7 +251,7 @@ class Plan(Rows):
 
 
 def plan_from(
-    current: ParamSet | Mapping[str, Param],
+    current: AnyParams,
     wanted: AnyParams,
     *,
     autopilot: str | None = None,
@@ -279,11 +281,19 @@ def plan_from(
         UsageError: an element of `include` is neither a category nor a glob; `current` and `wanted` are of
             different components or autopilots, or one has plain and the other extended parameters.
     """
-    wanted = set_of(wanted, is_extended=isinstance(current, ParamSet) and current.is_extended)
-    return _Planner(current, wanted, autopilot, encoding, options).plan()
+    check_keys(options, PlanOptions)
+    current = set_of(current, is_extended=isinstance(wanted, ParamSet) and wanted.is_extended)
+    wanted = set_of(wanted, is_extended=current.is_extended)
+    return Planner(current, wanted, autopilot, encoding, options).plan()
 
 
-def _check_origin(wanted: ParamSet, current: Mapping[str, object], autopilot: str | None) -> None:
+def check_keys(given: Mapping[str, object], known: type) -> None:
+    """Raise TypeError for an option that a TypedDict does not have: only type checkers compare them."""
+    if unknown := sorted(given.keys() - known.__annotations__.keys()):
+        raise TypeError(f"no option {unknown[0]!r}; see {known.__name__}")
+
+
+def _check_origin(wanted: ParamSet, current: ParamSet, autopilot: str | None) -> None:
     """Check that parameters are meant for a vehicle: shared names of two autopilots have different meanings.
 
     Raises:
@@ -291,30 +301,33 @@ def _check_origin(wanted: ParamSet, current: Mapping[str, object], autopilot: st
     """
     meant = None if wanted.identity is None else autopilot_name(wanted.identity.autopilot)
     of = f" of {wanted.source}" if wanted.source else ""
-    if isinstance(current, ParamSet):
-        if wanted.is_extended != current.is_extended:
-            kinds = ("extended", "plain") if wanted.is_extended else ("plain", "extended")
-            raise UsageError(f"the parameters{of} are {kinds[0]} ones, and {kinds[1]} ones are needed")
-        own = wanted.component, current.component
-        if None not in own and own[0] != own[1]:
-            raise UsageError(f"the parameters{of} are those of component {own[0]}, not of component {own[1]}")
+    if wanted.is_extended != current.is_extended:
+        kinds = ("extended", "plain") if wanted.is_extended else ("plain", "extended")
+        raise UsageError(f"the parameters{of} are {kinds[0]} ones, and {kinds[1]} ones are needed")
+    own = wanted.component, current.component
+    if None not in own and own[0] != own[1]:
+        raise UsageError(f"the parameters{of} are those of component {own[0]}, not of component {own[1]}")
     if {meant, autopilot} == {"px4", "ardupilot"}:
         raise UsageError(f"the parameters{of} are those of a vehicle with {meant}, not with {autopilot}")
 
 
-class _Planner:
-    """Makes the rows and stages of one plan; the arguments are those of `plan_from`."""
+class Planner:
+    """Makes the rows and stages of one plan; the arguments are those of `plan_from`.
+
+    `is_in_use` returns whether another vehicle has, or gets, the value of a system id parameter.
+    """
 
     def __init__(
         self,
-        current: ParamSet | Mapping[str, Param],
+        current: ParamSet,
         wanted: ParamSet,
         autopilot: str | None,
         encoding: Encoding | None,
         options: PlanOptions,
+        is_in_use: Callable[[str, Value], bool] = lambda *_: False,
     ) -> None:
-        self.current, self.wanted = current, wanted
-        self.identity = current.identity if isinstance(current, ParamSet) else None
+        self.current, self.wanted, self.is_in_use = current, wanted, is_in_use
+        self.identity = current.identity
         if autopilot is None and self.identity is not None:
             autopilot = autopilot_name(self.identity.autopilot)
         _check_origin(wanted, current, autopilot)
@@ -331,6 +344,7 @@ class _Planner:
         awaiting_reboot = self.awaiting_reboot(rows)
         hidden = tuple(map(_group_of, awaiting_reboot))
         file, own = self.wanted.identity, self.identity
+        kept = [row for row in rows.values() if row.status is not ApplyStatus.SKIPPED]
         return Plan(
             rows,
             self.stages(rows),
@@ -350,12 +364,13 @@ class _Planner:
             ),
             firmware=() if file is None or own is None else (file, own),
             awaiting_reboot=awaiting_reboot,
+            system_id=next((r.wanted.settable for r in kept if self.rules.has("system_id", r.name)), None),
         )
 
     def row(self, wanted: WrittenParam) -> ApplyRow:
         """Return the row of one parameter; `settle_missing` completes rows of missing parameters."""
         name = wanted.name
-        current: Param | WrittenParam | None = self.current.get(name)
+        current = self.current.get(name)
         before = None if current is None else current.settable
         kind = wanted.type if current is None or current.type is None else current.type
         info = self.described.get(name)
@@ -453,9 +468,11 @@ class _Planner:
     ) -> tuple[str, str] | None:
         """Return why a value is invalid, as category and sentence, or None."""
         value, info = target.settable, self.described.get(target.name)
-        is_system_id = not isinstance(value, bytes | str) and 1 <= value <= 255
-        if self.rules.has("system_id", target.name) and not is_system_id:
-            return WRONG, "a system id is a number from 1 to 255"
+        if self.rules.has("system_id", target.name):
+            if isinstance(value, bytes | str) or not 1 <= value <= 255:
+                return WRONG, "a system id is a number from 1 to 255"
+            if self.is_in_use(target.name, value):
+                return WRONG, f"another vehicle on this link has, or gets, the system id {value}"
         if kind is not None:
             try:
                 (EXTENDED if self.wanted.is_extended else PLAIN).encode(value, kind, self.encoding)
@@ -478,7 +495,7 @@ class _Planner:
 
     def _value_to_be(self, name: str) -> Value | None:
         """Return the wanted value of a parameter, or else its present value."""
-        param: Param | WrittenParam | None = self.wanted.get(name) or self.current.get(name)
+        param = self.wanted.get(name) or self.current.get(name)
         return None if param is None else param.settable
 
 

@@ -322,7 +322,7 @@ def test_all_vehicles_are_set_and_restored_each_with_its_own_values(
     command: Command, put: Put, file: File, tmp_path: Path
 ) -> None:
     air, vehicles = fleet()
-    file(FILE, "fleet.param")
+    file(f"{FILE}SYSID_THISMAV,7\n", "fleet.param")
     for system in (1, 2, 3):
         file(f"@include ../fleet.param\nWPNAV_SPEED,{system}00\n", f"own/{system}.param")
     own, backup = tmp_path / "own/{system}.param", tmp_path / "{system}.json"
@@ -366,11 +366,12 @@ def test_one_file_or_state_for_all_vehicles_is_refused(
     command: Command, put: Put, file: File, tmp_path: Path
 ) -> None:
     air, vehicles = fleet()
-    every = ["--vehicle", "all"]
+    every, one_id = ["--vehicle", "all"], file("SYSID_THISMAV,7\n", "id.param")
     file("RTL_ALT,3\n", "1.param")
     for words, why in (
         (["apply", file(), "--backup", "same.param"], "{uid} or {system}"),
         (["apply", tmp_path / "{system}.param"], "2.param: no such file"),
+        (["apply", one_id, "--include", "identity"], "vehicles would get the system id 7 too"),
         (["apply", file(), "--vehicle", 2], "vehicle"),
         (["restore", file()], "{uid} or {system} in its name"),
         (["restore", "--backup", "same.json"], "{uid} or {system}"),

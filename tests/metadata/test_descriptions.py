@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from paramclient import UsageError
 from paramclient.errors import FileError
-from paramclient.metadata import Metadata, ParamInfo, read_content, read_metadata
+from paramclient.metadata import Metadata, ParamInfo
+from paramclient.metadata.store import read_content, read_metadata
 from paramclient.model.values import ParamType
 
 DATA = Path(__file__).parents[1] / "data"

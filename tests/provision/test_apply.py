@@ -20,7 +20,7 @@ from paramclient.model.paramset import ParamSet
 from paramclient.model.values import ParamType
 from paramclient.protocol.ftp import Opcode, Packet
 from paramclient.provision import MISSING, ApplyProgress, ApplyResult, ApplyStatus, apply, plan, restore
-from paramclient.provision.apply_restore import load_restore_point, restore_categories
+from paramclient.provision.apply_restore import for_each, load_restore_point, restore_categories
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
 from paramclient.wire import frames, messages
 from tests.caches import PX4
@@ -360,15 +360,22 @@ async def test_a_system_id_takes_effect_at_once_or_after_a_reboot(
 
 
 async def test_a_system_id_of_another_vehicle_is_not_set() -> None:
+    """Nor one that another vehicle gets at its next start, or by another call at the same time."""
     vehicles = [ardupilot(), ardupilot(system=7)]
-    async with a_client(Air(vehicles)) as client:
-        component = await client.component(1, 1)
-        await client.component(7, 1)
-        result = await apply(component, {"SYSID_THISMAV": 7}, include="identity")
-    assert statuses(result) == {"SYSID_THISMAV": "refused"}
-    assert "another vehicle on this link" in result.rows["SYSID_THISMAV"].reason
-    assert not result.complete
-    assert [vehicle.system for vehicle in vehicles] == [1, 7]
+    async with a_client(tap := Tap(Air(vehicles))) as client:
+        one, two = await client.component(1, 1), await client.component(7, 1)
+        wanted: Table = {"SYSID_THISMAV": 7} | some("TUNE_01")
+        assert [*(await plan(one, wanted, include="identity")).problems] == ["SYSID_THISMAV"]
+        with pytest.raises(UsageError, match="SYSID_THISMAV: another vehicle on this link"):
+            await apply(one, wanted, include="identity")
+        assert not sets(tap)
+        result = await apply(one, wanted, include="identity", partial=True)
+        assert statuses(result) == {"SYSID_THISMAV": "refused", "TUNE_01": "accepted"}
+        wanted["SYSID_THISMAV"] = 9
+        for _ in range(2):
+            both = await for_each([one, two], lambda each: apply(each, wanted, include="identity"))
+            assert len(both.results) == len(both.errors) == 1
+    assert [vehicle.values["SYSID_THISMAV"] for vehicle in vehicles] in ([9, 7], [1, 9])
 
 
 @pytest.mark.parametrize("sent", [0, len(SETTINGS)])
