@@ -73,6 +73,7 @@ async def test_a_failed_socket_is_reopened(kind: str, errors: dict[str, list[int
         errors["recvfrom_into"].append(errno.EIO)
         far.sendto(HEARTBEAT, link.address)
         assert "cannot receive: Input/output error" in str(await failure(link))
+        assert link.reconnects
         await link.open()
         far.sendto(HEARTBEAT, link.address)
         assert [data for _, data in await link.receive()] == [HEARTBEAT]

@@ -8,7 +8,7 @@ import selectors
 import socket
 import struct
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager
 from functools import partial
 from pathlib import Path
@@ -53,7 +53,8 @@ async def opened(name: str) -> AsyncIterator[Any]:
     link = create_link(name)
     await link.open()
     try:
-        yield link
+        with anyio.fail_after(TIMEOUT):
+            yield link
     finally:
         await link.close()
 
@@ -91,37 +92,29 @@ LOOPBACKS = ["127.0.0.1", *(["::1"] if ipv6_works() else [])]
 @asynccontextmanager
 async def connected(kind: str) -> AsyncIterator[tuple[Any, Any]]:
     """Open a link of a kind and its remote side, after both have exchanged data."""
+    name = f"{kind}:127.0.0.1:0"
+    far: Any = None
+    other: Any = None
     with ExitStack() as stack:
-        far: Any
-        link: Any
-        if kind == "udpin":
-            link = create_link("udpin:127.0.0.1:0")
-            await link.open()
-            far = stack.enter_context(udp_socket(link.address))
-        elif kind == "udpout":
-            far = stack.enter_context(udp_socket())
-            link = create_link(f"udpout:127.0.0.1:{far.getsockname()[1]}")
-            await link.open()
-            far.connect(link.address)
-        elif kind == "serial":
+        if kind == "serial":
             far = stack.enter_context(Cable(Path(stack.enter_context(TemporaryDirectory()))))
-            link = create_link(far.link)
-            await link.open()
-        elif kind == "tcp":
-            listener = stack.enter_context(tcp_listener())
-            link = create_link(f"tcp:127.0.0.1:{listener.getsockname()[1]}")
-            await link.open()
-            far = stack.enter_context(listener.accept()[0])
-        else:
-            link = create_link("tcpin:127.0.0.1:0")
-            await link.open()
-            far = stack.enter_context(socket.create_connection(link.address, timeout=TIMEOUT))
-        try:
+            name = far.link
+        elif kind in ("udpout", "tcp"):
+            other = stack.enter_context(udp_socket() if kind == "udpout" else tcp_listener())
+            name = f"{kind}:127.0.0.1:{other.getsockname()[1]}"
+        async with opened(name) as link:
+            match kind:
+                case "udpin":
+                    far = stack.enter_context(udp_socket(link.address))
+                case "udpout":
+                    (far := other).connect(link.address)
+                case "tcp":
+                    far = stack.enter_context(other.accept()[0])
+                case "tcpin":
+                    far = stack.enter_context(socket.create_connection(link.address, timeout=TIMEOUT))
             far.send(HEARTBEAT)
             await collect(link, 1)
             yield link, far
-        finally:
-            await link.close()
 
 
 def stream_of(far: Any, size: int) -> bytes:
@@ -141,6 +134,7 @@ KINDS = ["udpin", "udpout", "tcp", "tcpin", "serial"]
 @pytest.mark.parametrize("kind", KINDS)
 async def test_bytes_in_both_directions(kind: str) -> None:
     async with connected(kind) as (link, far):
+        assert repr(link).endswith("open>")
         far.send(frame(1))
         [(peer, data)] = await collect(link, 1)
         assert data == frame(1)
@@ -154,25 +148,27 @@ async def test_bytes_in_both_directions(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-async def test_closing_wakes_the_receiver_and_frees_the_port(kind: str) -> None:
+async def test_closing_wakes_receiver_and_sender_and_frees_the_port(kind: str) -> None:
     files = open_files()
     async with connected(kind) as (link, _), anyio.create_task_group() as tasks:
         failures: list[LinkError] = []
         address: Any = getattr(link, "address", None)
 
-        async def receive() -> None:
-            with pytest.raises(LinkError) as caught:
-                await link.receive()
+        async def fail(call: Awaitable[object]) -> None:
+            with pytest.raises(LinkError, match="closed") as caught:
+                await call
             failures.append(caught.value)
 
-        tasks.start_soon(receive)
+        waiting = [link.receive(), *([link.send(bytes(50_000_000), None)] if link.is_stream else [])]
+        for each in waiting:
+            tasks.start_soon(fail, each)
         for _ in range(10):  # the simulated vehicle keeps tasks running
             await anyio.lowlevel.checkpoint()
         await link.close()
         with anyio.fail_after(TIMEOUT):
-            while not failures:
+            while len(failures) < len(waiting):
                 await anyio.lowlevel.checkpoint()
-        assert failures[0].link == link.name
+        assert {each.link for each in failures} == {link.name}
         await link.close()
         for call in (link.receive(), link.send(HEARTBEAT, None)):
             with pytest.raises(LinkError, match="not open"):
@@ -227,7 +223,9 @@ async def test_udpin_and_udpout_communicate(host: str) -> None:
         assert (data, peer[:2]) == (HEARTBEAT, (host, vehicle.address[1]))
         await station.send(frame(1), peer)
         [(far, data)] = await collect(vehicle, 1)
-        assert (data, far[:2]) == (frame(1), station.address)
+        assert (data, far[:2], host) == (frame(1), station.address, station.address[0])
+        await vehicle.send(frame(2), far)
+        assert await collect(station, 1) == [(peer, frame(2))]
 
 
 @pytest.mark.parametrize("kind", ["udpin", "udpout", "tcp", "tcpin"])
@@ -452,6 +450,7 @@ async def test_a_dropped_tcp_connection_can_be_reopened() -> None:
                 with pytest.raises(LinkError, match="not open"):
                     await link.send(frame(2), None)
                 await link.open()
+            await link.send(frame(3), peers[0])  # to a dropped connection: does nothing
             listener.accept()[0].close()
             assert peers[0] != peers[1]
 

@@ -128,6 +128,7 @@ def test_an_option_out_of_its_range_is_a_usage_error(options: str, problem: str)
 def test_create_link_returns_links_unchanged() -> None:
     link = SimLink(PX4Vehicle(), "sim:mine")
     assert create_link(link) is link
+    assert create_link(parse_link("udpin:14550")).name == "udpin:0.0.0.0:14550"
     wrapped = create_link(PX4Vehicle())
     assert isinstance(wrapped, SimLink)
     assert wrapped.name == "sim:custom"

@@ -8,11 +8,9 @@ import fcntl
 import os
 import struct
 import threading
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import anyio
 import anyio.lowlevel
@@ -23,7 +21,7 @@ from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, link, serial
 from paramclient.links.serial import open_asyncio
 from tests.cable import TIMEOUT, Cable
-from tests.links.test_links import HEARTBEAT
+from tests.links.test_links import HEARTBEAT, opened
 from tests.shell import a_client, bits, generic, until
 
 pytestmark = pytest.mark.asyncio
@@ -45,17 +43,6 @@ def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str
     if request.param == "asyncio":
         monkeypatch.setattr(serial, "open_port", open_asyncio)
     return str(request.param)
-
-
-@asynccontextmanager
-async def opened(cable: Cable) -> AsyncIterator[Any]:
-    link = create_link(cable.link)
-    await link.open()
-    try:
-        with anyio.fail_after(TIMEOUT):
-            yield link
-    finally:
-        await link.close()
 
 
 async def refusal(link: Link) -> LinkError:
@@ -96,7 +83,7 @@ async def test_unplugged_during_a_download(cable: Cable, port: str, caplog: pyte
 
 async def test_a_stalled_device_is_lost(cable: Cable, port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial, "STALL_TIMEOUT", 0.0)  # leaves the time for a full buffer at the baud rate
-    async with opened(cable) as link, anyio.create_task_group() as tasks:
+    async with opened(cable.link) as link, anyio.create_task_group() as tasks:
         got: list[tuple[Peer, bytes]] = []
         failures: list[LinkError] = []
 
@@ -140,14 +127,14 @@ async def test_an_open_port_is_exclusive_and_closing_frees_it(cable: Cable) -> N
             os.close(file)
         return bool(flag)
 
-    async with opened(cable) as link:
+    async with opened(cable.link) as link:
         assert is_exclusive()
         error = await refusal(create_link(cable.link))
         assert f"{cable.link}: {cable.device} is in use by another link or program" in str(error)
         await link.send(HEARTBEAT, None)
         assert cable.recv(100) == HEARTBEAT
     assert not is_exclusive()
-    async with opened(cable):
+    async with opened(cable.link):
         pass
 
 

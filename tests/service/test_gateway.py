@@ -1123,6 +1123,7 @@ def test_rule_13_names_of_endpoints(tmp_path: Path) -> None:
     assert parse_endpoint("udpin:0.0.0.0:14551?readonly&trusted").is_trusted
     signed = parse_endpoint(f"udpout:127.0.0.1:14550?sign={key}&trusted")
     assert signed.signer is not None
+    assert signed.name == "udpout:127.0.0.1:14550"
     assert not signed.is_trusted  # its frames keep their signatures
     with pytest.raises(UsageError, match="no endpoint"):
         parse_endpoint("sim:px4?readonly")

@@ -83,7 +83,7 @@ async def test_known_parameters_are_selected_by_name_and_pattern() -> None:
         assert list(found["params"]) == ["PARAM_01", *sorted(name for name in VALUES if "_2" in name)]
         assert found["seq"] == hub.feed.seq
         assert value(await browser.get(f"{V}/params/PARAM_03")) == VALUES["PARAM_03"]
-        problem(await browser.get(f"{V}/params/PARAM_99"), 404, "unknown-parameter")
+        assert problem(await browser.get(f"{V}/params/PARAM_99"), 404, "unknown-parameter")["nearest"]
 
 
 async def test_a_value_is_written_read_back_and_read_from_the_vehicle() -> None:
@@ -135,6 +135,7 @@ async def test_fetches_at_one_time_share_a_download_and_tell_their_progress() ->
         assert len({answer.json()["elapsed_s"] for answer in results}) == 1
         assert (await browser.post(f"{V}/fetch", json={})).json()["source"] == "cache"
         assert (await browser.post(f"{V}/fetch", json={"refresh": True})).json()["source"] != "cache"
+        assert (await browser.get("/api/vehicles")).json()["vehicles"][0]["fetches"] >= 3
 
 
 async def test_a_vehicle_that_is_lost_answers_no_request_with_a_problem() -> None:
@@ -172,6 +173,7 @@ async def test_metrics_and_openapi_are_complete() -> None:
         text = (await browser.get("/metrics")).text
         labels = 'link="sim:custom",system="1",component="1",extended="False"'
         assert f"paramclient_component_synced{{{labels}}} 1.0" in text
+        assert 'paramclient_link_bytes_received_total{link="sim:custom"} ' in text
         described = (await browser.get("/openapi.json")).json()
         assert {"get", "put"} <= described["paths"]["/api/vehicles/{system}/{component}/params/{name}"].keys()
         assert "Problem" in described["components"]["schemas"]
@@ -205,6 +207,7 @@ async def test_extended_parameters_are_fetched_written_and_followed() -> None:
         body = {"values": {"CAM_NAME": "hex:ff00fe"}}
         (result,) = (await browser.patch(f"{CAMERA}/params", params=EXT, json=body)).json()["results"]
         assert result["actual"] == "hex:ff00fe"
+        problem(await browser.get(f"{CAMERA}/params/NOPE", params=EXT), 404, "unknown-parameter")
         live = await browser.get(f"{CAMERA}/params/CAM_NAME", params={**EXT, "live": "true"})
         assert live.json()["value"] == "hex:ff00fe"
 
