@@ -120,7 +120,8 @@ def value_of(session: Session, param: Param, *, index: int | None = None) -> Rep
             ArduPilot sends these without an index.
     """
     if index is None:
-        index = NO_INDEX if param.index is None or session.identification.is_ardupilot else param.index
+        known = NO_INDEX if param.index is None or session.identification.is_ardupilot else param.index
+        index = known if session.table.names.get(known) == param.name else NO_INDEX  # of another count
     if session.dialect.has_ack:
         raw = ext_bytes(param).ljust(EXT_VALUE_SIZE, b"\0")
     elif param.is_raw:

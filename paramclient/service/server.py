@@ -176,8 +176,8 @@ def guard(app: ASGIApp, tokens: Tokens | None) -> ASGIApp:
         except (ServiceError, HTTPException) as error:
             await problem_response(error)(scope, receive, send_with_headers)
         else:
-            method = scope["method"].replace("HEAD", "GET")  # the server leaves the body out
-            await app({**scope, "method": method}, receive, send_with_headers)
+            # of a HEAD, the server leaves the body out
+            await app({**scope, "method": scope["method"].replace("HEAD", "GET")}, receive, send_with_headers)
 
     return guarded
 

@@ -250,9 +250,7 @@ async def test_rule_2_extended_parameters() -> None:
     camera = Tap(Camera())
     wanted = answers_of(Camera(), messages.ParamExtValue, messages.ParamExtRequestList(1, 100))
     async with gateway_over(camera) as served:
-        await served.clients[0].component(1, 100)
-        station, other, one = served.partner(), served.partner(system=9), wanted[2]
-        other.send(GCS)
+        station, other, one = await served.heard(), await served.heard(system=9), wanted[2]
         same = messages.ParamExtSet(1, 100, one.param_id, one.raw, one.param_type)
         await station.ask(same, seconds=3.0)  # before any list
         assert (len(station.of(messages.ParamExtAck)), other.of(messages.ParamExtAck)) == (1, [])
@@ -270,8 +268,7 @@ async def test_rule_2_extended_parameters() -> None:
         [acknowledged] = station.of(messages.ParamExtAck)
         assert acknowledged == messages.ParamExtAck("CAM_NAME", new.raw, ParamType.CUSTOM, 0)
         await station.ask(messages.ParamExtSet(1, 100, "CAM_NAME", bytes(128), ParamType.UINT8))
-        stays = messages.ParamExtAck("CAM_NAME", new.raw, ParamType.CUSTOM, 1)
-        assert station.of(messages.ParamExtAck) == [stays]
+        assert station.of(messages.ParamExtAck) == [replace(acknowledged, param_result=1)]
 
 
 def direct_file(path: str, size: int) -> bytes:
@@ -557,6 +554,18 @@ async def test_rule_3_a_value_is_not_served_after_a_set_without_an_answer() -> N
         vehicle.is_mute = False
         await station.ask(seconds=2.0)
         assert by_name(station) == {"PARAM_01": struct.pack("<i", 5)}
+
+
+async def test_rule_3_a_value_is_served_without_its_index_after_another_count() -> None:
+    """The values are those of the vehicle, and the indices of an earlier list."""
+    also = Puppet(lambda message: (), heartbeat=None)
+    async with in_sync(Air([small_px4(), also])) as (_, vehicle, station):
+        also.say(ParamValue("NEW", bytes(4), ParamType.INT32, 26, 65535))
+        for place, seconds in (((26, 65535), 0.1), ((25, 8), 5.0)):
+            await station.ask(GCS, seconds=seconds)
+            await station.ask(ParamRequestRead(1, 1, "PARAM_07", -1), seconds=0.1)
+            assert station.of(ParamValue)[-1] == ParamValue("PARAM_07", struct.pack("<i", 7), 6, *place)
+            assert bool(requested(vehicle)) == (place == (25, 8))
 
 
 async def test_rule_3_a_lost_vehicle_is_silent() -> None:
@@ -905,9 +914,8 @@ async def test_rule_8_an_unsigned_set_is_signed_for_a_trusted_endpoint_alone(is_
         await station.ask(set_to("PARAM_01", 5), seconds=3.0)
         assert model.values["PARAM_01"] == (5 if is_trusted else 1)
         await station.ask(LIST, seconds=3.0)
-        are_signed = {bool(data[2]) for data in station.datagrams}
         assert (len(station.of(ParamValue)), station.lost[1, 1]) == (26 * is_trusted, 0)
-        assert are_signed == {not is_trusted}
+        assert {bool(data[2]) for data in station.datagrams} == {not is_trusted}
 
 
 async def test_rule_8_no_set_is_signed_for_an_unsigned_station_where_the_vehicle_does_not_sign() -> None:
