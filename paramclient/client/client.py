@@ -15,7 +15,7 @@ import anyio
 from paramclient.cache import ParamCache
 from paramclient.client.cache_writer import CacheWriter, choose_cache
 from paramclient.client.component import Component
-from paramclient.client.core import ClientCore
+from paramclient.client.core import ClientCore, seconds_of
 from paramclient.client.signing import Signing
 from paramclient.client.streams import Stream, Subscribers
 from paramclient.client.taps import Capture, Traffic, TrafficReport
@@ -313,7 +313,7 @@ class ParamClient:
         await self.component(timeout=timeout)
         if expect is None:
             timeout = anyio.current_time() - began + VEHICLES_LISTENING_TIME
-        with anyio.CancelScope(deadline=math.inf if timeout is None else began + timeout):
+        with anyio.CancelScope(deadline=began + seconds_of(timeout)):
             while expect is None or len(self.autopilots) < expect:
                 await self.core.link_task.wait_for_activity()
         if expect is not None and len(self.autopilots) < expect:
@@ -355,19 +355,13 @@ class ParamClient:
         link = self.link
         if self.listens_only or (isinstance(link, SimLink) and link.has_one_vehicle) or peer is not None:
             return await self.component(system, component, peer=peer, timeout=timeout)
-        station = self.core.station
-        return await self._wait_for(
-            lambda: selection.only_vehicle(
-                station.nodes.values(),
-                system,
-                component,
-                anyio.current_time(),
-                listening_since=station.listening_since,
-            ),
-            selection.address_in_words(system, component),
-            timeout,
-            asked=(system, component),
-        )
+        station, awaited = self.core.station, selection.address_in_words(system, component)
+
+        def choose() -> Node | float | None:
+            nodes, now, since = station.nodes.values(), anyio.current_time(), station.listening_since
+            return selection.only_vehicle(nodes, system, component, now, listening_since=since)
+
+        return await self._wait_for(choose, awaited, timeout, asked=(system, component))
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = COMPONENT_TIMEOUT
@@ -395,7 +389,7 @@ class ParamClient:
             return node if node is not None and node.presence.received_at > began else None
 
         found = await self._wait_for(choose, selection.address_in_words(system, component.component), timeout)
-        with anyio.move_on_after(timeout), self.core.station.gate.until_closed():
+        with anyio.move_on_after(seconds_of(timeout)), self.core.station.gate.until_closed():
             await found.node.identification.settled()
         if before.uid is not None and found.identity.uid is None:
             subject = f"the hardware id of {found.node.channel}"
@@ -428,7 +422,7 @@ class ParamClient:
         if refresh:
             self.core.station.check_may_send()
         nodes = self.core.station.nodes
-        deadline = math.inf if timeout is None else anyio.current_time() + timeout
+        deadline = anyio.current_time() + seconds_of(timeout)
         await self._wait_for(
             lambda: next((each for each in nodes.values() if system in (None, each.system)), None),
             "a component" if system is None else f"a component of system {system}",
@@ -441,7 +435,7 @@ class ParamClient:
             for address, each in self._components.items()
             if system in (None, each.system) and each.node.identification.has_parameters
         }
-        left = None if timeout is None else deadline - anyio.current_time()
+        left = None if timeout is None else max(0.0, deadline - anyio.current_time())
         results: dict[Address, FetchResult] = {}
         silent: dict[Address, NoReply | CacheError] = {}
         scopes: dict[Address, anyio.CancelScope] = {}
@@ -552,7 +546,7 @@ class ParamClient:
         check_ids(system, component)
         probe_at = 0.0 if system and component else math.inf
         found = choose()
-        with anyio.move_on_after(timeout):
+        with anyio.move_on_after(seconds_of(timeout)):
             while not (isinstance(found, Node) or self.core.is_over):
                 now = anyio.current_time()
                 probe_at = max(probe_at, station.listening_since + HEARTBEAT_WAIT)

@@ -12,7 +12,7 @@ from typing import Final, Protocol
 import anyio
 
 from paramclient.cache import check_author
-from paramclient.client.core import ClientCore
+from paramclient.client.core import ClientCore, seconds_of
 from paramclient.client.signing import timestamp_now
 from paramclient.client.streams import Changes, Subscribers
 from paramclient.errors import AmbiguousVehicle, CacheError, NoReply, NotDurable, ParamClientError, UsageError
@@ -351,10 +351,10 @@ class Component:
             CacheError: with `durable`, the disk cannot be written; nothing was sent.
             LinkError: the link had failed already, or the client was closed.
         """
-        by = check_author(author)
+        by, seconds = check_author(author), seconds_of(timeout)
         pairs = await self._check_writes(values, settle, durable=durable)
         result = await write_many(
-            self.session, pairs, progress=progress, timeout=timeout, settle=settle, force=force, author=by
+            self.session, pairs, progress=progress, timeout=seconds, settle=settle, force=force, author=by
         )
         hint = hint_of_node(self.core.station, self.node, anyio.current_time())
         outcomes = [replace(each, error=_hinted(each.error, hint)) for each in result.outcomes]
@@ -412,7 +412,7 @@ class Component:
         if timeout is None and self._waits_for_others:
             timeout = PASSIVE_TIMEOUT
         with self.limited(None, "all parameters", sends=False):
-            with anyio.move_on_after(timeout):
+            with anyio.move_on_after(seconds_of(timeout)):
                 if not refresh:
                     await self.wait_for_cache()
                 if self.core.station.listens_only:
@@ -660,7 +660,7 @@ class Component:
             self.core.station.check_may_send()
         began = anyio.current_time()
         try:
-            with anyio.move_on_after(timeout) as scope:
+            with anyio.move_on_after(seconds_of(timeout)) as scope:
                 yield scope
             if scope.cancelled_caught:
                 raise NoReply(what, attempts=0, waited=anyio.current_time() - began)

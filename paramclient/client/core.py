@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import sys
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from functools import partial
@@ -217,6 +218,14 @@ class ClientCore:
         error, self._error = self._error, None
         if error is not None:
             raise error
+
+
+def seconds_of(timeout: float | None) -> float:
+    """Return a timeout in seconds, infinite for None; raise UsageError for anything but a number from 0."""
+    seconds = math.inf if timeout is None else timeout
+    if not (isinstance(seconds, int | float) and seconds >= 0):
+        raise UsageError(f"a timeout is a number of seconds from 0, or None, not {timeout!r}")
+    return seconds
 
 
 def _spawn(function: Callable[[], Coroutine[Any, Any, None]]) -> None:

@@ -16,9 +16,11 @@ import anyio
 
 from paramclient.cache import check_author
 from paramclient.client.component import Component
+from paramclient.client.core import seconds_of
 from paramclient.errors import (
     AnotherVehicle,
     CacheError,
+    FileError,
     InvalidParameters,
     NoReply,
     ParamClientError,
@@ -155,7 +157,7 @@ async def run(
     error: ParamClientError | None = None
     one = _Run(component, wanted, options, is_restore=is_restore)
     try:
-        with anyio.move_on_after(options.get("timeout")) as scope:
+        with anyio.move_on_after(seconds_of(options.get("timeout"))) as scope:
             await one.begin()
             with component.watch.held():  # a changed count starts no download besides those of the run
                 await one.store_state()
@@ -192,7 +194,7 @@ class _Run:
         self.is_restore, self._reboots_allowed = is_restore, options.get("reboot", False)
         self.sent: set[str] = set()
         self._before: ParamSet | None = None  # the state before the first write
-        self._snapshot: int | None = None  # its number in the cache
+        self._end_operation: Callable[[], None] | None = None  # records in the cache that the run has ended
         self._settled: dict[str, ApplyRow] = {}  # outcomes before the last read
         self._written: Counter[str] = Counter()  # acknowledged writes
         self._notes: dict[str, str] = {}  # of the acknowledged writes
@@ -231,7 +233,10 @@ class _Run:
         component, inspection, path = self.component, self._inspection, self.options.get("backup")
         writer, cache = component.core.cache_writer, component.core.cache
         if path is not None:
-            await writer.run_in_thread(lambda: write_file(path, inspection.table))
+            try:
+                await writer.run_in_thread(lambda: write_file(path, inspection.table))
+            except FileError as error:
+                raise FileError(f"nothing was sent: {error.reason}", source=error.source) from error
         self._before = inspection.table
         if cache is None or not self._plan.to_write:
             return
@@ -251,11 +256,10 @@ class _Run:
                 )
             )
         except CacheError as error:
-            why = f"nothing was sent, as the state before cannot be stored: {error}"
-            raise CacheError(
-                f"{why}. Without a cache (--no-cache, or cache=False), none is stored"
-            ) from error
-        self._snapshot = snapshot.id
+            hint = "Without a cache (--no-cache, or cache=False), none is stored"
+            why = f"nothing was sent, as the state before cannot be stored: {error}. {hint}"
+            raise CacheError(why) from error
+        self._end_operation = partial(cache.end_operation, snapshot.id)
 
     async def write_and_verify(self) -> None:
         """Write and verify until no stage is pending; record in the cache that the run was not interrupted.
@@ -280,9 +284,8 @@ class _Run:
                 break
         if self.options.get("durable") and self.sent:
             await self.component.core.cache_writer.write_durably(self.component.node)
-        number, cache = self._snapshot, self.component.core.cache
-        if cache is not None and number is not None:
-            await self.component.core.cache_writer.attempt(partial(cache.end_operation, number))
+        if self._end_operation is not None:
+            await self.component.core.cache_writer.attempt(self._end_operation)
 
     def result(self, error: ParamClientError | None, elapsed: float) -> ApplyResult:
         """Return the result of the run."""
@@ -370,14 +373,12 @@ class _Run:
 
     async def _write_stage(self, stage: Stage) -> None:
         """Write the values of a stage: many at a time, or one by one if they may end the connection."""
-        if not stage.is_last:
-            await self._write(stage.rows)
-            return
-        for row in stage.rows:
-            if self._rules.has("system_id", row.name):
-                await self._write_system_id(row)
+        is_last = self._rules.has("last", stage.rows[0].name)
+        for rows in [[row] for row in stage.rows] if is_last else [stage.rows]:
+            if self._rules.has("system_id", rows[0].name):
+                await self._write_system_id(rows[0])
             else:
-                await self._write([row])
+                await self._write(rows)
 
     async def _write(self, rows: Sequence[ApplyRow]) -> None:
         """Write values in order, many at a time.

@@ -143,14 +143,12 @@ class Stage:
         reveals: whether other parameters may appear afterwards.
         reboot_first: whether the vehicle must reboot before the next stage: values that are set before the
             reboot would be lost, or their parameters do not exist yet.
-        is_last: whether the values may end the connection. These are written one by one.
     """
 
     purpose: str
     rows: tuple[ApplyRow, ...]
     reveals: bool = False
     reboot_first: bool = False
-    is_last: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -406,7 +404,7 @@ class Planner:
             reboot_first = reveals and any(
                 (may_appear and row.needs_reboot) or self.rules.has("resets", row.name) for row in chosen
             )
-            stages.append(Stage(_PURPOSES[place], chosen, reveals, reboot_first, is_last=place == _LAST))
+            stages.append(Stage(_PURPOSES[place], chosen, reveals, reboot_first))
         return tuple(stages)
 
     def place(self, row: ApplyRow) -> int:

@@ -243,9 +243,7 @@ def test_a_backup_restores_the_calibration_of_the_very_same_vehicle(
         assert vehicle.values["COMPASS_OFS_X"] == 5.0
 
 
-def test_restore_reverts_the_last_apply_and_says_what_it_undoes(
-    command: Command, put: Put, file: File
-) -> None:
+def test_restore_reverts_the_last_apply_and_names_the_changes(command: Command, put: Put, file: File) -> None:
     vehicle = copter()
     command("apply", put(vehicle), file(), "--include", "calibration")
     assert vehicle.values["COMPASS_OFS_X"] == 12.5
@@ -487,9 +485,7 @@ def test_metadata_gives_ranges_and_reboots(command: Command, put: Put, file: Fil
     assert "takes effect after a reboot: WPNAV_SPEED" in outcome.err
 
 
-def test_nothing_is_compared_or_written_in_a_doubtful_encoding(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
+def test_nothing_is_compared_or_set_in_doubtful_encodings(command: Command, put: Put, tmp_path: Path) -> None:
     vehicle = Partial(encoding=Encoding.C_CAST)
     url, saved = put(vehicle), tmp_path / "quad.param"
     assert command("save", url, saved).code == 0

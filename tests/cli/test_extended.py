@@ -103,9 +103,7 @@ def test_apply_reports_what_it_cannot_do(command: Command, put: Put, tmp_path: P
     assert (kinds.code, "are plain ones, and extended ones are needed" in kinds.err) == (2, True)
 
 
-def test_restore_undoes_apply_from_the_cache_and_from_a_backup(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
+def test_restore_undoes_apply_from_the_cache_and_a_backup(command: Command, put: Put, tmp_path: Path) -> None:
     camera = Camera(
         {"CAM_NAME": "Front", "CAM_KEY": b"\xff\0\xfe", "CAM_CLOCK": (8, 2**62 + 1), "CAM_EV": 0.5}
     )

@@ -87,9 +87,7 @@ def test_a_mistaken_argument_is_named(command: Command, words: str, text: str) -
     ],
     ids=lambda words: words[0],
 )
-def test_an_unknown_name_has_one_exit_code_and_a_suggestion(
-    command: Command, put: Put, words: list[object]
-) -> None:
+def test_unknown_names_have_one_exit_code_and_a_hint(command: Command, put: Put, words: list[object]) -> None:
     Path("quad.param").write_text("MC_ROLL_PP,5\n", encoding="utf-8")
     url = put(PX4Vehicle(table={"MC_ROLL_P": 4.0, "MC_YAW_P": 2.0}))
     assert command("fetch", url).code == 0

@@ -43,9 +43,7 @@ def test_a_name_that_fits_two_parameters_in_other_cases_is_not_written(command: 
     assert vehicle.values == {"Gain": 1.0, "gain": 5.0}
 
 
-def test_fetch_show_history_and_save_take_names_and_patterns(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
+def test_fetch_show_history_save_take_names_and_patterns(command: Command, put: Put, tmp_path: Path) -> None:
     url = put(PX4Vehicle(table=TABLE))
     fetched = command("fetch", url, *NAMES, "--json")
     assert (fetched.json["received"], set(fetched.json["params"])) == (4, set(TABLE))

@@ -39,9 +39,7 @@ def values(vehicle: Vehicle, *names: str) -> dict[str, Any]:
     return {name: vehicle.values[name] for name in names}
 
 
-def test_named_parameters_get_the_defaults_of_the_vehicle_and_restore_undoes_it(
-    command: Command, put: Put
-) -> None:
+def test_named_parameters_get_the_vehicles_defaults_and_restore_undoes_it(command: Command, put: Put) -> None:
     vehicle = copter()
     before, tap = dict(vehicle.values), Tap(vehicle)
     done = command("reset", put(tap), "COUNT", "mc_*")
@@ -80,9 +78,7 @@ def test_defaults_of_metadata_are_used_where_the_vehicle_gives_none(
     assert values(vehicle, *"ABC") == {"A": 2.5, "B": 6.0, "C": 7}
 
 
-def test_the_metadata_of_the_vehicle_is_downloaded_where_it_gives_no_defaults(
-    command: Command, put: Put
-) -> None:
+def test_metadata_of_the_vehicle_is_downloaded_where_it_gives_no_defaults(command: Command, put: Put) -> None:
     vehicle = PX4Vehicle(table={"MC_ROLL_P": 4.0}, metadata=True)
     vehicle.set_param("MC_ROLL_P", 6.5)
     said = "1/1 px4: 1 of 1 default from the metadata of the firmware, which does not have the defaults of an"

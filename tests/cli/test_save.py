@@ -96,9 +96,7 @@ def test_a_second_parameter_of_the_same_name_is_told(command: Command, put: Put,
     assert (saved.code, "7 of 8 parameters, without a second GAIN_3" in saved.err) == (0, True), saved.err
 
 
-def test_cached_parameters_outside_of_the_list_are_counted_apart(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
+def test_cached_parameters_in_no_list_are_counted_apart(command: Command, put: Put, tmp_path: Path) -> None:
     vehicle = PX4Vehicle(table=dict.fromkeys("ABCD", 1), not_in_use=["C", "D"])
     assert command("get", put(vehicle), "A", "C", "D").code == 0
     refused = command("save", "1", tmp_path / "quad.json")

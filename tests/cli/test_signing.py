@@ -107,9 +107,7 @@ def test_a_vehicle_that_does_not_obey_is_found_out(put: Put, key_file: Path, com
         assert (done.code, done.out, text in done.err) == (1, "", True)
 
 
-def test_nothing_is_sent_before_the_link_is_said_to_be_safe(
-    put: Put, key_file: Path, command: Command
-) -> None:
+def test_nothing_is_sent_before_the_link_is_called_safe(put: Put, key_file: Path, command: Command) -> None:
     url = put(vehicle := small_px4())
     for words, text in (
         (("setup", url, "--signing-key", key_file), "add --link-is-safe"),

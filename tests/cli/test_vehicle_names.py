@@ -81,9 +81,7 @@ def test_a_name_finds_one_vehicle(place: int, name: str) -> None:
         ),
     ],
 )
-def test_an_unknown_or_ambiguous_name_lists_the_vehicles(
-    name: str, reason: str, listed: Sequence[int]
-) -> None:
+def test_unknown_and_ambiguous_names_list_the_vehicles(name: str, reason: str, listed: Sequence[int]) -> None:
     with pytest.raises((UnknownVehicle, AmbiguousVehicle)) as caught:
         find_vehicle(KEPT, name, place="here")
     assert isinstance(caught.value, AmbiguousVehicle if name in AMBIGUOUS else UnknownVehicle)

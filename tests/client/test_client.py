@@ -199,6 +199,18 @@ async def test_invalid_values_and_names_are_not_sent() -> None:
 # Time-outs
 
 
+@pytest.mark.parametrize("timeout", [math.nan, -1.0, "1"])
+async def test_a_timeout_is_a_number_of_seconds(timeout: Any) -> None:
+    async with connected(generic()) as (client, component):
+        for call in (
+            *(component.get("A", timeout=timeout), component.set("A", 1, timeout=timeout)),
+            *(component.set_many({"A": 1}, timeout=timeout), component.fetch_all(timeout=timeout)),
+            *(client.component(timeout=timeout), client.fetch_all(timeout=timeout)),
+        ):
+            with pytest.raises(errors.UsageError, match="a timeout is a number of seconds from 0"):
+                await call
+
+
 async def test_every_call_has_a_time_limit_of_its_own() -> None:
     tap = Tap(generic())
     async with connected(tap) as (_, component):

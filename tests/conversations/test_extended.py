@@ -17,27 +17,19 @@ from paramclient.protocol.set_results import SetStatus
 from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, Camera, Endpoint, PX4Vehicle
 from paramclient.wire import messages
-from tests.conversations.virtual import (
-    Conversation,
-    Silence,
-    Tap,
-    converse,
-    losing,
-    meanwhile,
-    virtual_on_both,
-)
+from tests.conversations import virtual
 
 CAMERA = (1, 100)
 
 
 @asynccontextmanager
-async def filming(endpoint: Endpoint) -> AsyncIterator[tuple[Conversation, Session]]:
+async def filming(endpoint: Endpoint) -> AsyncIterator[tuple[virtual.Conversation, Session]]:
     """Open a station on a camera, and wait for it: gives its extended parameters too."""
-    async with converse(endpoint) as conversation:
+    async with virtual.converse(endpoint) as conversation:
         yield conversation, (await conversation.node(*CAMERA)).extended
 
 
-@virtual_on_both
+@virtual.virtual_on_both
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 async def test_values_of_every_type_are_fetched_read_and_set(loss: float) -> None:
     camera = Camera()
@@ -88,23 +80,23 @@ async def test_progress_extends_the_wait_and_a_lost_result_is_requested_again(se
     def is_result(message: messages.Message) -> bool:
         return isinstance(message, messages.ParamExtAck) and message.param_result == 0
 
-    endpoint = Tap(Camera(slow={"CAM_MODE": seconds}))
+    endpoint = virtual.Tap(Camera(slow={"CAM_MODE": seconds}))
     async with filming(endpoint) as (_, session):
         result = await write(session, "CAM_MODE", 2)
         assert (result.actual, result.attempts) == (2, 1)
-        endpoint.down = losing(1, is_result)
+        endpoint.down = virtual.losing(1, is_result)
         result = await write(session, "CAM_WBMODE", 2)
         assert (result.actual, result.attempts) == (2, 2)
-        endpoint.down = losing(1, is_result)
+        endpoint.down = virtual.losing(1, is_result)
         with anyio.fail_after(seconds + 2.5):
             result = await write(session, "CAM_MODE", 1)
         assert (result.actual, result.attempts) == (1, 1)  # a read has shown the value
 
 
-@virtual_on_both
+@virtual.virtual_on_both
 @pytest.mark.parametrize("after", [0.5, 1.9, 2.1])
 async def test_a_camera_that_is_lost_while_it_reports_progress_ends_the_set(after: float) -> None:
-    endpoint = Silence(Camera(slow={"CAM_MODE": 10.0}), at=1e9)
+    endpoint = virtual.Silence(Camera(slow={"CAM_MODE": 10.0}), at=1e9)
     async with filming(endpoint) as (_, session):
         await fetch_all(session)
         endpoint.at = anyio.current_time() + after
@@ -127,11 +119,11 @@ async def test_what_other_stations_request_and_set_is_taken() -> None:
         assert conversation.changes[-1].by == "station 254/190"
 
 
-@virtual_on_both
+@virtual.virtual_on_both
 async def test_the_refusal_of_another_stations_set_is_not_taken_for_ours() -> None:
     async with filming(Air.symmetric([Camera()], delay=0.05)) as (conversation, session):
         await fetch_all(session)
-        async with meanwhile(write(session, "CAM_MODE", 2)) as results:
+        async with virtual.meanwhile(write(session, "CAM_MODE", 2)) as results:
             await anyio.sleep(0.02)
             refusal = messages.ParamExtAck("CAM_MODE", bytes(128), 5, errors.ExtAckResult.VALUE_UNSUPPORTED)
             conversation.hear(refusal, component=100)
@@ -140,7 +132,7 @@ async def test_the_refusal_of_another_stations_set_is_not_taken_for_ours() -> No
 
 
 async def test_a_component_may_have_both_kinds_or_none() -> None:
-    async with converse(Air([Camera({"A": "text"}, plain={"A": 5}), PX4Vehicle()])) as conversation:
+    async with virtual.converse(Air([Camera({"A": "text"}, plain={"A": 5}), PX4Vehicle()])) as conversation:
         node = await conversation.node(*CAMERA)
         await fetch_all(node.plain)
         await fetch_all(node.extended)

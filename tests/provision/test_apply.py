@@ -167,13 +167,14 @@ async def test_a_refused_or_adjusted_value_does_not_stop_the_others() -> None:
     assert statuses(again) == dict.fromkeys(SETTINGS, "unchanged") | refused | {"TUNE_01": "refused"}
 
 
-async def test_the_state_is_stored_before_anything_is_sent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_the_state_is_stored_before_a_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cache, tap = ParamCache(tmp_path / "cache.sqlite3"), Tap(ardupilot())
 
     def fail(*_: object, **__: object) -> None:
         raise CacheError("the disk is full")
+
+    def failing(_: ApplyProgress) -> None:
+        raise RuntimeError("raised in progress")
 
     async with ParamClient(tap, cache=cache) as client:
         component = await client.component()
@@ -183,6 +184,14 @@ async def test_the_state_is_stored_before_anything_is_sent(
                 await apply(component, some("TUNE_01"))
         with pytest.raises(TypeError, match="no option 'dry_run'"):
             await apply(component, some("TUNE_01"), dry_run=True)  # type: ignore[call-arg]
+        with pytest.raises(TypeError, match="no option 'inclde'; see PlanOptions"):
+            await plan(component, some("TUNE_01"), inclde="identity")  # type: ignore[call-arg]
+        with pytest.raises(UsageError, match="a timeout is a number of seconds"):
+            await apply(component, some("TUNE_01"), timeout=-1)
+        with pytest.raises(RuntimeError, match="raised in progress"):  # and no coroutine is left unawaited
+            await apply(component, some("TUNE_01"), progress=failing)
+        with pytest.raises(UsageError, match=r"a\.json: nothing was sent: cannot be written: "):
+            await apply(component, some("TUNE_01"), backup=tmp_path / "no folder" / "a.json")
         assert sets(tap) == []
         first = await apply(component, some("TUNE_01"))
         await apply(component, some("TUNE_01"), backup=tmp_path / "a.json")  # nothing to write, no snapshot

@@ -189,6 +189,12 @@ def test_a_value_that_the_parameter_cannot_take_is_invalid(
     assert not made.stages
 
 
+def test_plain_values_are_a_table_and_an_unknown_option_is_an_error() -> None:
+    assert plan_from({"A": 1}, {"A": 2}).rows["A"].before == 1
+    with pytest.raises(TypeError, match="no option 'inclde'; see PlanOptions"):
+        plan_from({"A": 1}, {"A": 2}, inclde="identity")  # type: ignore[call-arg]
+
+
 def test_a_value_outside_of_the_metadata_range_is_invalid() -> None:
     table = held(P=1.0, Q=7.0)
     info = {"P": Info(minimum=0.1, maximum=2.0), "Q": Info(maximum=2.0)}
@@ -206,9 +212,7 @@ def test_a_value_outside_of_the_metadata_range_is_invalid() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize(("autopilot", "says"), [("px4", "may stop"), ("ardupilot", "does not answer")])
-def test_a_value_that_the_autopilot_cannot_store_must_be_forced(
-    value: float, autopilot: str, says: str
-) -> None:
+def test_a_value_that_autopilots_cannot_store_must_be_forced(value: float, autopilot: str, says: str) -> None:
     table, wanted = held(P=1.0), written(P=value)
     status, category, reason = only_row(plan_from(table, wanted, autopilot=autopilot, include=OUT_OF_RANGE))
     assert (status, category) == (ApplyStatus.REFUSED, WRONG)
