@@ -110,8 +110,6 @@ _FORMATS: Final = {
     FileFormat.PARM: _pairs(" "),
     FileFormat.MISSION_PLANNER: _pairs(","),
 }
-_SEVERAL: Final = (FileFormat.JSON, FileFormat.QGC)
-"""The formats that hold several components."""
 
 
 def loads(
@@ -166,7 +164,9 @@ def _read(reading: Reading, file_format: FileFormat | str | None) -> ParamFile:
     try:
         reading.partial &= kind_of(reading.data) is None  # a file of another kind is no part of a file
         chosen = _format_of(reading) if file_format is None else FileFormat(file_format)
-        return _FORMATS[chosen].read(reading, chosen)
+        file = _FORMATS[chosen].read(reading, chosen)
+        _check(file.sets, chosen, reading.source)
+        return file
     except FileError as error:
         if (kind := kind_of(reading.data)) is None:
             raise
@@ -284,26 +284,26 @@ def _header_lines(params: ParamSet) -> Iterator[str]:
     yield from (f"{begin}{text}" for begin, text in (("from ", params.source), (LACKS, params.lacks)) if text)
 
 
-def _check(sets: Sequence[ParamSet], file_format: FileFormat) -> None:
-    """Raise UsageError for sets that are not valid, or that a format cannot hold together."""
+def _check(sets: Sequence[ParamSet], file_format: FileFormat, source: str = "") -> None:
+    """Raise UsageError for sets that are not valid, or FileError if no format holds them together."""
     if not sets:
         raise UsageError("there are no parameters to write")
-    if len(sets) > 1 and file_format not in _SEVERAL:
+    if len(sets) > 1 and file_format not in (FileFormat.JSON, FileFormat.QGC):
         there = ", ".join(map(address, sets))
         raise UsageError(f"the format {file_format} holds one component, and there are {there}; choose one")
+    extended = {each.is_extended for each in sets}
+    if True in extended and file_format is not FileFormat.JSON:
+        raise UsageError(f"the format {file_format} cannot hold extended parameters; write .json")
+    if len(extended) > 1:
+        raise FileError("a file has either plain or extended parameters, not both", source=source)
     seen = set()
     for each in sets:
         for param in each.values():
             check_name(param.name)
         ids = (each.system, AUTOPILOT if each.component is None else each.component)
         if ids in seen:  # nothing distinguishes the two
-            raise UsageError(f"two sets have the same component, {address(each)}")
+            raise FileError(f"two sets have the same component, {address(each)}", source=source)
         seen.add(ids)
-    extended = {each.is_extended for each in sets}
-    if True in extended and file_format is not FileFormat.JSON:
-        raise UsageError(f"the format {file_format} cannot hold extended parameters; write .json")
-    if len(extended) > 1:
-        raise UsageError("a file has either plain or extended parameters, not both")
 
 
 # Files that are no parameter files, although they are mistaken for them

@@ -73,7 +73,7 @@ def read_json_text(text: str, source: str) -> Any:
         FileError: invalid JSON, or a repeated key.
     """
     try:
-        return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
+        return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant, parse_int=_parse_int)
     except json.JSONDecodeError as error:
         message = f"expected JSON: {error.msg} (column {error.colno})"
         raise FileError(message, source=source, line=error.lineno) from None
@@ -141,6 +141,12 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
+def _parse_int(digits: str) -> int | float:
+    """Return a whole number; infinity beyond the range of a double, as for a fraction."""
+    number = float(digits)
+    return int(digits) if math.isfinite(number) else number
+
+
 def _no_constant(word: str) -> NoReturn:
     raise ValueError(f"{word} is not valid JSON; write it as text: {json.dumps(word)}")
 
@@ -171,13 +177,10 @@ def read_json(reading: Reading, file_format: FileFormat) -> ParamFile:
     if not isinstance(content, dict) or _KEY not in content:
         raise FileError("not a parameter file of paramclient (JSON)", source=reading.source)
     if type(version := content[_KEY]) is int and version > VERSION:
-        raise FileError(
-            f"a newer paramclient wrote it, in version {version} of the format", source=reading.source
-        )
+        what = f"a newer paramclient wrote it, in version {version} of the format"
+        raise FileError(what, source=reading.source)
     found = _checked(reading, content, (), _DOCUMENT, {_KEY, "sets"})
     sets = [_set(reading, each, ("sets", place)) for place, each in enumerate(found.get("sets", []))]
-    if len({each.is_extended for each in sets}) > 1:
-        reading.fault(None, "a file has either plain or extended parameters, not both")
     return reading.file(file_format, tuple(found.get("header", [])), sets=tuple(sets))
 
 
@@ -250,7 +253,8 @@ def _time(content: object) -> float:
         raise UsageError(f"a time is written as 2026-01-31T12:00:00Z{_found(content)}") from None
     if moment.tzinfo is None:
         raise UsageError("the time needs its zone, as in 2026-01-31T12:00:00Z")
-    return moment.timestamp()
+    time_text(at := moment.timestamp())  # else it could not be written again
+    return at
 
 
 def _type(content: object) -> ParamType | int:

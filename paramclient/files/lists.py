@@ -42,7 +42,6 @@ FILES_MAX: Final = 64
 thousands."""
 
 _QGC_COLUMNS: Final = "Vehicle-Id Component-Id Name Value Type"
-_QGC_ROW: Final = "vehicle, component, name, value and type, with tabs between them"
 _QGC_IDS: Final = "a system from 1 to 255 and a component from 0 to 255 in the first two columns"
 _QGC_TYPE: Final = "a type from 1 to 10 (MAV_PARAM_TYPE) in the last column"
 _qgc_nan: Final = re.compile(r"--\.-+").fullmatch
@@ -192,7 +191,7 @@ def read_qgc(reading: Reading, file_format: FileFormat) -> ParamFile:
             columns = [each.strip() for each in line.text.split("\t")]
         try:
             if len(columns) != 5:
-                raise UsageError(_QGC_ROW)
+                raise UsageError("vehicle, component, name, value and type, with tabs between them")
             system, component = _whole(columns[0], 1, 255, _QGC_IDS), _whole(columns[1], 0, 255, _QGC_IDS)
             kind = ParamType(_whole(columns[4], 1, 10, _QGC_TYPE))
             value = _qgc_value(columns[3], kind)
