@@ -232,6 +232,7 @@ def test_programs_are_typed(tmp_path: Path) -> None:
     files = [tmp_path / f"{re.sub('[^a-z0-9]', '_', name.lower())}.py" for name, _ in programs()]
     for file, (_, code) in zip(files, programs(), strict=True):
         file.write_text(code, encoding="utf-8")
+    files += (ROOT / "examples").rglob("*.py")
     settings = ["--config-file", str(ROOT / "pyproject.toml"), "--cache-dir", str(ROOT / ".mypy_cache")]
     done = subprocess.run(
         [sys.executable, "-m", "mypy", *settings, "--no-error-summary", *map(str, files)],
