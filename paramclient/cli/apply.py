@@ -293,7 +293,8 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
             options = ApplyOptions(include=include, info=info, partial=state.partial, backup=backup)
             system = plan_for(session.component, state.params, None, options).system_id
             if system is not None and system in given:
-                problem = f"other vehicles would get the system id {system!r} too; a name may have {{system}}"
+                hint = "a file for each has {system} in its name"
+                problem = f"nothing was sent: several vehicles would get the system id {system!r}; {hint}"
                 raise errors.FileError(problem, source=state.params.source)
             given.add(system)
             options |= {"reboot": flags.reboot, "allow_armed": flags.allow_armed}

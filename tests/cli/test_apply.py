@@ -369,7 +369,7 @@ def test_one_file_or_state_for_all_vehicles_is_refused(
     for words, why in (
         (["apply", file(), "--backup", "same.param"], "{uid} or {system}"),
         (["apply", tmp_path / "{system}.param"], "2.param: no such file"),
-        (["apply", one_id, "--include", "identity"], "vehicles would get the system id 7 too"),
+        (["apply", one_id, "--include", "identity"], "the system id 7; a file for each has {system}"),
         (["apply", file(), "--vehicle", 2], "vehicle"),
         (["restore", file()], "{uid} or {system} in its name"),
         (["restore", "--backup", "same.json"], "{uid} or {system}"),
