@@ -194,9 +194,8 @@ async def test_rule_2_px4_answers_its_hash_and_goes_on_with_its_list() -> None:
     async with in_sync(small_px4()) as (served, vehicle, station):
         await station.ask(ParamRequestRead(1, 1, "_HASH_CHECK", -1), seconds=0.1)
         [answer] = station.of(ParamValue)
-        component = await served.clients[0].component()
         assert (answer.param_id, answer.param_index, answer.param_count) == ("_HASH_CHECK", 65535, 25)
-        assert int.from_bytes(answer.raw, "little") == component.hash
+        assert int.from_bytes(answer.raw, "little") == (await served.clients[0].component()).hash
         await station.ask(ParamSet(1, 1, "_HASH_CHECK", bytes(4), 5))
         assert not requested(vehicle)
 
@@ -395,8 +394,7 @@ async def test_rule_2_a_station_does_not_close_the_session_of_the_fetch(opcode: 
     async with gateway_over(vehicle) as served:
         component = await served.clients[0].component()
         station = served.partner()
-        station.send(LIST)
-        await anyio.sleep(0.1)
+        await station.ask(LIST, seconds=0.1)
         while component.sync_state != "synced":
             assert (await station.ask_file(opcode, seconds=0.1))[-1].opcode == Opcode.ACK
         assert not vehicle.messages(ParamRequestList)
@@ -478,8 +476,7 @@ async def test_rule_3_no_list_is_requested_beside_a_file_that_fills_the_radio(se
 async def test_rule_3_an_old_proof_is_renewed_behind_the_answer_and_differences_are_announced() -> None:
     model = small_px4()
     async with in_sync(model, watch_interval=0) as (_, vehicle, station):
-        station.send(GCS)
-        await anyio.sleep(6.0)
+        await station.ask(GCS, seconds=6.0)
         model.load({"PARAM_01": 77})  # announces nothing
         vehicle.received.clear()
         await station.ask(LIST, seconds=0.3)
@@ -958,8 +955,7 @@ async def test_rule_9_the_gateway_has_the_id_of_no_station() -> None:
 
 async def test_rule_10_a_list_of_all_components() -> None:
     async with in_sync(Air([small_px4(), Puppet(lambda message: (), component=5)])) as (_, vehicle, station):
-        station.send(ParamRequestList(1, 5))
-        await anyio.sleep(30.0)
+        await station.ask(ParamRequestList(1, 5), seconds=30.0)
         vehicle.received.clear()
         await station.ask(ParamRequestList(1, 0), seconds=1.0)
         assert len(station.of(ParamValue)) == 26
@@ -1040,6 +1036,8 @@ async def test_rule_11_what_a_station_sends_ends_where_another_one_returns_it(se
             assert len(station.frames) <= 4
         sent = [each.command for each in vehicle.messages(messages.CommandLong) if each.command < 405]
         assert sent == [400] * (1 if seconds else 2) + [401, 402, 403, 404]
+        own = [frame.sequence for _, frame, _ in vehicle.received if frame.system == 254]
+        assert len(own) == len({*own})
 
 
 async def test_rule_11_neither_an_echo_of_the_radio_nor_a_key_reaches_a_station() -> None:
@@ -1220,8 +1218,7 @@ async def test_a_silent_reset_by_a_station_is_found() -> None:
 async def test_a_restart_during_a_list() -> None:
     model = PX4Vehicle()
     async with in_sync(model) as (served, _, station):
-        station.send(GCS, LIST)
-        await anyio.sleep(0.01)
+        await station.ask(GCS, LIST, seconds=0.01)
         served.link.is_stuck = True
         model.reboot(down=8.0)
         await anyio.sleep(20.0)
@@ -1243,8 +1240,7 @@ switched = partial(ArduPilotVehicle, table=TABLE, groups={"GRP_ENABLE": HIDDEN})
 async def test_a_switch_of_a_group_during_a_list() -> None:
     """The list has one count; what the switch has shown is announced."""
     async with in_sync(switched()) as (served, _, station):
-        station.send(GCS, LIST)
-        await anyio.sleep(0.004)
+        await station.ask(GCS, LIST, seconds=0.004)
         await (await served.clients[0].component()).set("GRP_ENABLE", 1.0)
         await anyio.sleep(20.0)
         indexed = [each for each in station.of(ParamValue) if each.param_index != 65535]

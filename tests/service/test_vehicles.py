@@ -16,6 +16,7 @@ from paramclient.model.values import ParamType
 from paramclient.sim import ArduPilotVehicle, Camera, PX4Vehicle
 from tests.recordings import DATA
 from tests.service.hub import V, browsing, problem, service, synced, until, value
+from tests.service.test_events import events
 from tests.shell import VALUES, FlakyLink, PeersLink, Tap, generic, small_px4
 
 CAMERA = "/api/vehicles/1/100"
@@ -39,9 +40,9 @@ async def test_a_link_that_cannot_be_opened_is_tried_again_until_its_vehicle_is_
 async def test_a_link_that_fails_for_good_is_opened_with_a_fresh_client() -> None:
     link = FlakyLink(generic())
     link.reconnects = False
-    async with browsing(link) as browser:
+    async with browsing(link) as browser, events(browser) as stream:
         await link.drop()
-        await asyncio.sleep(0.1)
+        assert (await stream.next("vehicle"))["vehicle"] is None
         problem(await browser.get(f"{V}/params"), 404, "unknown-vehicle")
         await synced(browser)
         assert link.openings == 2
