@@ -26,7 +26,7 @@ SOURCES = {
     for path in (ROOT / "paramclient").rglob("*.py*")
     if path.suffix != ".pyc"
 }
-BESIDE = {"pytest_paramclient.py", "paramclient_command.py"}
+PLUGIN = "pytest_paramclient.py"
 SERVED = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/service/page").glob("*.*")}
 TABLES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/sim/tables").glob("*.*")}
 
@@ -57,7 +57,7 @@ def metadata(wheel: dict[str, bytes]) -> Message:
 def test_the_wheel_has_the_package_and_nothing_else(wheel: dict[str, bytes]) -> None:
     shipped = {name for name in wheel if ".dist-info/" not in name}
     data = {"paramclient/py.typed", "paramclient/provision/apply_rules.toml"}
-    assert shipped == SOURCES | TABLES | SERVED | data | BESIDE
+    assert shipped == SOURCES | TABLES | SERVED | data | {PLUGIN}
     assert len(TABLES) >= 3
     assert "paramclient/service/page/index.html" in SERVED
 
@@ -82,7 +82,7 @@ def test_pytest_finds_the_plugin(wheel: dict[str, bytes], tmp_path: Path) -> Non
 
 
 def test_the_sdist_can_be_built_and_tested(sdist: set[str]) -> None:
-    assert sdist >= SOURCES | TABLES | SERVED | BESIDE
+    assert sdist >= SOURCES | TABLES | SERVED | {PLUGIN}
     assert sdist >= {"pyproject.toml", "README.md", "CHANGELOG.md", "LICENSE", "Makefile", "docs/conf.py"}
     data = (path for path in (ROOT / "tests/data").rglob("*") if path.is_file())
     assert sdist >= {path.relative_to(ROOT).as_posix() for path in data}
