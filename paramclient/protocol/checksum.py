@@ -189,7 +189,8 @@ class _Proof:
                 elif guess := self._guess(place, difference):
                     guesses |= guess
                 elif len(place) > 1:
-                    ends = self._ends_of_moving(place)
+                    moving = self._moving - (self._fresh if len(place) == len(self._rows) else set())
+                    ends = {end for at in moving for end in (at, at + 1)}.intersection(place[1:])
                     if not ends:
                         divided.append(place)
                     parts |= self._divide(place, ends)
@@ -212,11 +213,6 @@ class _Proof:
     @property
     def _parts(self) -> int:
         return min(max(PARTS_MIN, int(self._round_trip / PART_TIME)), PARTS_MAX)
-
-    def _ends_of_moving(self, place: range) -> set[int]:
-        """Return where the rows that move begin and end in a range, but for those that were just compared."""
-        moving = self._moving - (self._fresh if len(place) == len(self._rows) else set())
-        return {end for at in moving for end in (at, at + 1)}.intersection(place[1:])
 
     def _divide(self, place: range, ends: set[int]) -> set[range]:
         """Divide a range at these rows, and into parts of equal size."""

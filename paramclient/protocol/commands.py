@@ -62,10 +62,8 @@ async def request_message(channel: Channel, kind: type[M]) -> M | None:
     def accept(message: Message) -> M | bool | None:
         if isinstance(message, kind):
             return message
-        is_refusal = isinstance(message, messages.CommandAck) and message.result not in (
-            CommandResult.ACCEPTED,
-            CommandResult.IN_PROGRESS,
-        )
+        assert isinstance(message, messages.CommandAck)
+        is_refusal = message.result not in (CommandResult.ACCEPTED, CommandResult.IN_PROGRESS)
         return False if is_refusal else None
 
     what = f"message {number:.0f} of {channel}"

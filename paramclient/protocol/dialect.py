@@ -71,10 +71,6 @@ class Dialect:
         name, index = (which, -1) if isinstance(which, str) else ("", which)
         return self.read_request(*target, name, index)
 
-    def request_set(self, target: tuple[int, int], name: str, raw: bytes, number: int) -> Message:
-        """Return the request to set a parameter to these bytes, in this type."""
-        return self.set_request(*target, name, raw, number)
-
 
 def _plain_param(name: str, raw: bytes, number: int, index: int | None, encoding: Encoding) -> Param:
     bits, is_raw = bits_of_wire(raw, number, encoding)

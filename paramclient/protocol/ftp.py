@@ -251,12 +251,10 @@ async def _opened(
                     channel, Opcode.OPEN_FILE_RO, path, data, attempts=attempts, sequence=sequence
                 )
                 break
-            except NoReply:
+            except (NoReply, FileTransferError) as error:
                 is_requested = False
-                raise
-            except FileTransferError as error:
-                is_requested = False
-                if error.code != FileErrorCode.INVALID_SESSION or attempt + 1 == BUSY_ATTEMPTS:
+                is_busy = isinstance(error, FileTransferError) and error.code == FileErrorCode.INVALID_SESSION
+                if not is_busy or attempt + 1 == BUSY_ATTEMPTS:
                     raise
                 await anyio.sleep(BUSY_TIME)
         session = answer.session

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -51,6 +52,8 @@ PASS_OVERHEAD: Final = 0.15
 """Seconds that another pass of the list takes beside its values."""
 FRUITLESS_PASSES_MAX: Final = 5
 """Passes in a row without a new value, after which the count may be false: a request can be lost."""
+TIMES_MAX: Final = 3
+"""Times that a value may come in one list, requested by several programs: others are answers to reads."""
 QUEUE_TIME: Final = 1.0
 """Seconds without a missing value after which no answer to a read waits behind others in the queue of a slow
 radio: PX4 fills that with its list within a second, at 57600 baud for 6 s, and answers reads behind it."""
@@ -119,6 +122,7 @@ class _Download:
         self._count: int | None = None
         self._began = self._last = 0.0
         self._begins_at = -math.inf  # at the latest, of a list that was requested repeatedly
+        self._times: Counter[int] = Counter()  # that each index was received
         self._reached = -1  # the highest index
         self._listed = 0  # values of this pass that no read had asked for
         self._listed_at = 0.0  # when the last of them arrived
@@ -142,7 +146,7 @@ class _Download:
                     self._reading.add(1)
                     self.channel.send(dialect.request_read(target, 1))
                 return dialect.request_list(target)
-            which = int(attempt % 8 != 7)  # 1 is everywhere but where 0 is the only one
+            which = int(attempt % 4 != 1)  # 1 is everywhere but where 0 is the only one
             self._reading.add(which)
             return dialect.request_read(target, which)
 
@@ -183,6 +187,7 @@ class _Download:
             await self._next_pass()
             left -= len(self._received) == before
         is_silent = self.channel.is_silent(self._began)
+        has_loss |= not (serves_reads or self._listed)  # the last pass has brought nothing
         if not has_loss and not is_silent:
             self.table.end_list()
         self.result.missing = missing = self._missing()
@@ -368,7 +373,9 @@ class _Download:
                 self._skipped.clear()
                 self._tried.clear()
                 self._reached = -1
-        if index not in self._reading and (index > self._reached or index not in self._tried):
+        self._times[index] += 1
+        is_other = index in self._tried or self._times[index] > TIMES_MAX
+        if index not in self._reading and (index > self._reached or not is_other):
             self._listed_at = self._last
             self._listed += 1
         if index in self._received:

@@ -200,7 +200,8 @@ def encode_entries(rows: Iterable[PackedParam], *, with_defaults: bool, read_siz
                 value += default.to_bytes(kind.size, "little")
         except OverflowError:
             raise UsageError(f"{name}: its value or default has more bits than {kind.name}") from None
-        shared = _shared(last, name)
+        others = (at for at, letter in enumerate(name[:-1]) if last[at : at + 1] != letter)
+        shared = next(others, len(name) - 1)  # one character remains, as the file cannot encode none
         own = name[shared:].encode("ascii")
         entry = bytes((number, shared | len(own) - 1 << 4)) + own + value
         over = (length + len(entry)) % read_size
@@ -209,9 +210,3 @@ def encode_entries(rows: Iterable[PackedParam], *, with_defaults: bool, read_siz
         length += len(entry)
         yield entry
         last = name
-
-
-def _shared(last: str, name: str) -> int:
-    """Return how many characters to share; one of the name's own remains, as the file cannot encode none."""
-    shared_max = min(len(last), len(name) - 1)
-    return next((at for at in range(shared_max) if last[at] != name[at]), shared_max)

@@ -147,7 +147,8 @@ async def _ask(
         return min(most, singles) + math.ceil(max(most - singles, 0) / copies(singles))
 
     wait, timing = queue_time(session), channel.timing
-    is_certain, singles = bool(is_served) and not requests, 1 if requests else BACKOFF_FROM
+    is_there, singles = which in table.params or which in table.names, 1 if requests else BACKOFF_FROM
+    is_certain = bool(is_served) and is_there and not requests
     is_known, has_time = timing.round_trip is not None, timing.timeout(0) * FIRST_ATTEMPTS > PATIENCE_MIN
     may_be_off = which == HASH_CHECK and is_known and (table.hash is None or bool(table.unverified()))
     is_first = is_served is None and (may_be_off if which == HASH_CHECK else has_time or not is_known)
@@ -160,7 +161,8 @@ async def _ask(
         request, inbox, accept, what=what, attempts=attempts_max, timeout_min=wait, copies=copies
     )
     # Else it may be of the list, the acknowledgement of a set, or the answer to a read by index.
-    if not (session.only_by_index or None in session.reading or which in session.sent):
+    is_of_control = not requests and session.control.locked()
+    if not (session.only_by_index or None in session.reading or which in session.sent or is_of_control):
         session.serves_reads[type(which)] = True
     return received
 
@@ -194,13 +196,10 @@ async def read_many(session: Session, names: Iterable[str]) -> None:
         LinkError: the link is closed for good.
     """
 
-    async def read_one(name: str) -> None:
-        with suppress(NoReply, VehicleError):
-            await read_param(session, name)
-
     async with task_group() as tasks:
         for name in names:
-            tasks.start_soon(read_one, name)
+            tasks.start_soon(read_again, session, name, anyio.current_time())
+    session.channel.gate.check()
 
 
 async def read_again(session: Session, name: str, at: float) -> None:
@@ -251,7 +250,7 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
         if control is None or is_proven or control.param_id == which:
             return control
         if str not in session.serves_reads:
-            await anyio.sleep(session.channel.timing.timeout(0))  # for its other answers
+            await anyio.sleep(session.channel.timing.slowest)  # for its other answers
             await _try(session, control.param_id)
         session.only_by_index = session.serves_reads.get(str) is False
         return control if session.serves_reads.get(str) else None

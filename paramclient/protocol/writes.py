@@ -311,8 +311,11 @@ class _Write:
             kind = ValueUnsupported if answer.param_result == ExtAckResult.VALUE_UNSUPPORTED else SetFailed
             why = f"{channel} refused {self.name}: {ExtAckResult.name_of(answer.param_result)}"
             refused = kind(why, *channel.target, code=answer.param_result, name=self.name)
-        elif isinstance(answer, Param) and answer.type == self.before.type:
-            return answer
+        elif isinstance(answer, Param):
+            if answer.type == self.before.type:
+                return answer
+            await anyio.sleep(channel.timing.slowest + channel.timing.timeout(0))  # for its other ones
+            self.session.acknowledging.discard(self.name)
         if not channel.is_silent(self._began):
             with suppress(NoReply):  # only a read shows a changed type, or an extended parameter's value
                 shown = await self._read(inbox)
@@ -339,7 +342,7 @@ class _Write:
         self.session.acknowledging.add(self.name)
         self.session.sent[self.name] = self._raw
         dialect, number = self.session.dialect, self.before.type
-        return dialect.request_set(self.channel.target, self.name, self._raw, number)
+        return dialect.set_request(*self.channel.target, self.name, self._raw, number)
 
     def _accept(self, message: Message) -> Param | ParamExtAck | None:
         """Return an acknowledgement: PARAM_EXT_ACK, the wanted value, or any in another type."""
@@ -362,7 +365,6 @@ class _Write:
 
     async def _read(self, inbox: Inbox) -> Param:
         """Return the parameter as the component reports it now."""
-        self.session.acknowledging.discard(self.name)
         param = await read_param(self.session, self.name)
         while inbox and not self.session.dialect.has_ack:
             self._accept(await inbox.next())  # a refusal that came behind the value

@@ -27,22 +27,10 @@ from paramclient.model.values import ParamType
 from paramclient.provision import apply
 from paramclient.sim import Air, ArduPilotVehicle, Camera, Endpoint, PX4Vehicle, SimParam
 from paramclient.wire import messages
+from tests import shell
 from tests.caches import read_only
 from tests.client.conftest import connected, fetched, table_in
 from tests.conversations.virtual import Tap as Filter
-from tests.shell import (
-    VALUES,
-    Radio,
-    Tap,
-    a_client,
-    bits,
-    in_simulated_time,
-    outcome,
-    settled,
-    simulated_time_loop,
-    small_px4,
-    until,
-)
 from tests.simulated_on_udp import flying
 
 ODD = ("CAL_ACC0_XOFF", "PARAM_03", "PARAM_07")
@@ -57,7 +45,7 @@ async def session(endpoint: Endpoint, path: Path | ParamCache) -> FetchResult:
 
 def kept(path: Path, system: int = 1) -> dict[str, int]:
     """The values that the cache holds."""
-    return bits(table_in(path, system=system).params)
+    return shell.bits(table_in(path, system=system).params)
 
 
 def history(path: Path, name: str | None = None, **which: Any) -> list[tuple[str, Any, Any, str]]:
@@ -82,31 +70,31 @@ async def test_an_unchanged_vehicle_is_not_downloaded_again(path: Path) -> None:
     volatile = {each.name for each in vehicle.entries if each.row.volatile and each.name in vehicle.params}
     assert (await session(vehicle, path)).source == "stream"
     proven_at = table_in(path).synced_at
-    tap = Tap(vehicle)
+    tap = shell.Tap(vehicle)
     async with ParamClient(Air.symmetric([tap], delay=0.1), cache=path) as client:
         await anext(client.events())
         received_at = anyio.current_time()
         component = await client.component()
-        assert bits(component.params) == bits(vehicle.params), "from the cache, before anything was requested"
+        assert shell.bits(component.params) == shell.bits(vehicle.params), "from the cache, without a request"
         assert component.state == "cached"
         assert trusts(component, volatile) == {Trust.CACHED}
         result = await component.fetch_all()
         assert anyio.current_time() - received_at < 0.62, "round trips: identity, hash, values outside of it"
         assert (result.source, result.complete, result.hash) == ("cache", True, vehicle.announced_hash())
-        assert bits(result.params) == bits(vehicle.params)
+        assert shell.bits(result.params) == shell.bits(vehicle.params)
         assert trusts(component, component.params.keys() - volatile) == {Trust.VERIFIED}
         assert trusts(component, volatile) == {Trust.LIVE}
         assert repr(component) == "<Component 1/1 px4 synced 903 params from cache in 0.40 s>"
     reads = [message.param_id for message in tap.messages(messages.ParamRequestRead)]
     assert sorted(reads) == sorted([messages.HASH_CHECK, *volatile])
     assert not tap.messages(messages.ParamRequestList)
-    assert kept(path) == bits(vehicle.params)
+    assert kept(path) == shell.bits(vehicle.params)
     assert table_in(path).synced_at != proven_at
 
 
 async def test_changes_are_on_the_disk_within_the_flush_interval_whatever_a_commit_takes(path: Path) -> None:
     """Beside a busy event loop, commits took 0.03 to 0.11 s in turn, and the first one longest."""
-    loop = simulated_time_loop()
+    loop = shell.simulated_time_loop()
     durations = itertools.chain([0.11], itertools.cycle([0.03, 0.1, 0.05, 0.11, 0.04]))
     sent: dict[float, float] = {}
     ages: list[float] = []
@@ -120,7 +108,7 @@ async def test_changes_are_on_the_disk_within_the_flush_interval_whatever_a_comm
             ages.extend(loop.now - sent.pop(value) for value in begun_with)
             return result
 
-        async with connected(small_px4(), cache=cache) as (_, component):
+        async with connected(shell.small_px4(), cache=cache) as (_, component):
             await component.set("PARAM_01", 1)
             with mock.patch.object(cache, "save", slow):
                 for value in range(100, 300):
@@ -136,21 +124,21 @@ async def test_a_fetch_waits_for_the_cached_table(path: Path, delay: float) -> N
     """The cached table is known only with the identity, which is late at a long round trip."""
     vehicle = ArduPilotVehicle()
     await session(vehicle, path)
-    async with a_client(Air.symmetric([vehicle], delay=delay), cache=path) as client:
-        await until(lambda: client.components)
+    async with shell.a_client(Air.symmetric([vehicle], delay=delay), cache=path) as client:
+        await shell.until(lambda: client.components)
         result = await client.components[1, 1].fetch_all()
         assert (result.source, result.missing) == ("cache", ())
 
 
 async def test_a_change_between_two_sessions_is_a_cache_miss(path: Path) -> None:
-    await session(PX4Vehicle(table=VALUES), path)
-    vehicle = PX4Vehicle(table={**VALUES, "PARAM_01": 1000}, not_in_use=["PARAM_04"])
+    await session(PX4Vehicle(table=shell.VALUES), path)
+    vehicle = PX4Vehicle(table={**shell.VALUES, "PARAM_01": 1000}, not_in_use=["PARAM_04"])
     async with connected(vehicle, cache=path) as (_, component):
         changes = component.changes()
         result = await component.fetch_all()
         assert (result.source, result.count, result.hash) == ("stream", 23, vehicle.announced_hash())
         assert {(await anext(changes)).name for _ in range(2)} == {"PARAM_01", "PARAM_04"}
-    assert kept(path) == bits(vehicle.params)
+    assert kept(path) == shell.bits(vehicle.params)
     assert sorted(history(path)) == [("PARAM_01", 1, 1000, "vehicle"), ("PARAM_04", 4, None, "vehicle")]
     assert (await session(vehicle, path)).source == "cache"
 
@@ -164,33 +152,33 @@ def is_no_command(message: messages.Message) -> bool:
 
 @pytest.mark.parametrize("known", [False, True])
 async def test_another_vehicle_takes_the_place_within_a_session(path: Path, known: bool) -> None:
-    first, second = small_px4(uid=0xA), small_px4(uid=0xB)
+    first, second = shell.small_px4(uid=0xA), shell.small_px4(uid=0xB)
     second.set_param("PARAM_01", 77)
     if known:
         await session(second, path)
-    first.tick(simulated_time_loop().time())
-    second.reboot(simulated_time_loop().time(), down=math.inf)
+    first.tick(shell.simulated_time_loop().time())
+    second.reboot(shell.simulated_time_loop().time(), down=math.inf)
     async with fetched(Air([first, second]), cache=path) as (_, component):
         first.reboot(anyio.current_time(), down=math.inf)
         second.reboot(anyio.current_time(), down=10.0)
         await asyncio.sleep(10.5)
         assert component.identity.uid == f"{0xB:016x}"
         if known:
-            assert bits(component.params) == bits(second.params)
+            assert shell.bits(component.params) == shell.bits(second.params)
         result = await component.fetch_all()
         assert result.source == ("cache" if known else "stream")
-        assert bits(result.params) == bits(second.params)
+        assert shell.bits(result.params) == shell.bits(second.params)
         await asyncio.sleep(1.0)
     with ParamCache(path) as cache:
         for vehicle, uid in ((first, 0xA), (second, 0xB)):
             table = cache.component(f"uid:{uid:016x}")
-            assert bits(table.params) == bits(vehicle.params)
+            assert shell.bits(table.params) == shell.bits(vehicle.params)
             assert (table.hash, table.complete) == (vehicle.announced_hash(), True)
         assert not any(cache.history(each.key) for each in cache.vehicles()), "nothing was changed"
 
 
 async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
-    vehicle = PX4Vehicle(table=VALUES)
+    vehicle = PX4Vehicle(table=shell.VALUES)
     link = Filter(vehicle, up=is_no_command)
     async with ParamClient(link, cache=path) as client:
         began = anyio.current_time()
@@ -199,7 +187,7 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
         assert (await component.fetch_all()).complete
         await asyncio.sleep(20.0)
         assert component.identity.uid is None
-    assert kept(path) == bits(vehicle.params), "kept under its system id and link"
+    assert kept(path) == shell.bits(vehicle.params), "kept under its system id and link"
     vehicle.reboot(anyio.current_time())
     async with ParamClient(link, cache=path) as client:
         began = anyio.current_time()
@@ -208,22 +196,22 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
         assert math.isclose(anyio.current_time() - began, 0.5, abs_tol=0.01)
         assert await client.component() is component
         assert 0.5 < anyio.current_time() - began < component_module.CACHE_TIMEOUT + 0.01
-        assert bits(component.params) == bits(vehicle.params)
+        assert shell.bits(component.params) == shell.bits(vehicle.params)
         assert (await component.fetch_all()).complete
     vehicle.reboot(anyio.current_time())
     async with ParamClient(link, cache=path) as client:
-        waiting = asyncio.create_task(outcome(client.component()))
+        waiting = asyncio.create_task(shell.outcome(client.component()))
         await asyncio.sleep(0.1)
-    await settled()
+    await shell.settled()
     assert isinstance(waiting.result(), errors.ClientClosed)
 
 
 @pytest.mark.parametrize("fetched", [True, False])
 async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetched: bool) -> None:
-    await session(PX4Vehicle(table=VALUES), path)
-    changed = PX4Vehicle(table={**VALUES, "PARAM_01": 99}, not_in_use=["PARAM_02"])
+    await session(PX4Vehicle(table=shell.VALUES), path)
+    changed = PX4Vehicle(table={**shell.VALUES, "PARAM_01": 99}, not_in_use=["PARAM_02"])
     link = Filter(changed, up=is_no_command)
-    tap = Tap(link)
+    tap = shell.Tap(link)
     async with connected(tap, cache=path) as (_, component):
         if fetched:
             assert (await component.fetch_all()).complete
@@ -247,7 +235,7 @@ async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetche
     assert params["PARAM_01"].value == 99
     assert ("PARAM_02" in params) != fetched
     assert (await session(changed, path)).source == ("cache" if fetched else "stream")
-    assert bits(table_in(path, component.identity.key).params) == bits(changed.params)
+    assert shell.bits(table_in(path, component.identity.key).params) == shell.bits(changed.params)
 
 
 # Keeping it right
@@ -259,7 +247,7 @@ async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_compute
     path: Path, volatile: Collection[str], fetched: bool
 ) -> None:
     """Where it cannot be, it may stand for more than our set: for what was not received as well."""
-    vehicle = small_px4(volatile=volatile)
+    vehicle = shell.small_px4(volatile=volatile)
     await session(vehicle, path)
     for name, value in (("PARAM_01", 100), ("PARAM_04", 400), ("PARAM_01", 101)):
         async with connected(vehicle, cache=path) as (_, component):
@@ -267,7 +255,7 @@ async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_compute
                 assert (await component.fetch_all()).source == "cache"
             await component.set(name, value)
         assert (await session(vehicle, path)).source == ("stream" if volatile is ODD else "cache"), name
-        assert kept(path) == bits(vehicle.params)
+        assert kept(path) == shell.bits(vehicle.params)
     assert history(path, "PARAM_01") == [("PARAM_01", 1, 100, "us"), ("PARAM_01", 100, 101, "us")]
 
 
@@ -278,14 +266,14 @@ async def test_a_search_takes_no_longer_for_what_was_changed_before(path: Path) 
     asked = []
     for tuned in range(1, 17, 2):
         vehicle.load({f"SERVO{tuned}_MIN": 1111, f"RC{tuned}_DZ": 33})
-        tap = Tap(vehicle)
+        tap = shell.Tap(vehicle)
         assert (await session(tap, path)).source == "cache"
         asked.append(len(tap.messages(messages.FileTransfer)))
     assert max(asked[4:]) <= max(asked[:4]), asked
 
 
 async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(path: Path) -> None:
-    vehicle = small_px4()
+    vehicle = shell.small_px4()
     await session(vehicle, path)
     async with connected(vehicle, cache=path) as (_, component):
         before = (await component.get("PARAM_01")).value
@@ -305,10 +293,10 @@ async def test_every_own_write_is_in_the_history_however_briefly_it_was_valid(pa
     ]
 
 
-@in_simulated_time
+@shell.in_simulated_time
 async def test_a_first_value_is_as_old_as_its_request(path: Path) -> None:
     """It may have waited for a busy program, while another one has stored a later value."""
-    async with connected(Air.symmetric([small_px4()], delay=1.0), cache=path) as (_, component):
+    async with connected(Air.symmetric([shell.small_px4()], delay=1.0), cache=path) as (_, component):
         await component.fetch_all()
     cached = table_in(path)
     assert cached.synced_at is not None
@@ -316,7 +304,7 @@ async def test_a_first_value_is_as_old_as_its_request(path: Path) -> None:
 
 
 async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_before(path: Path) -> None:
-    vehicle = small_px4()
+    vehicle = shell.small_px4()
     before, vehicle_had = (vehicle.param(name).value for name in ("PARAM_01", "PARAM_02"))
     async with connected(vehicle, cache=path) as (_, component):
         await component.set("PARAM_01", 100, author="anna")
@@ -327,7 +315,7 @@ async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_befor
 
 @pytest.mark.parametrize("author", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
 async def test_an_author_must_be_printable_ascii(path: Path, author: str) -> None:
-    async with connected(small_px4(), cache=path) as (_, component):
+    async with connected(shell.small_px4(), cache=path) as (_, component):
         with pytest.raises(errors.UsageError, match="author must have 1 to 128 printable ASCII"):
             await component.set("PARAM_01", 100, author=author)
         with pytest.raises(errors.UsageError, match="author must have"):
@@ -335,8 +323,8 @@ async def test_an_author_must_be_printable_ascii(path: Path, author: str) -> Non
 
 
 async def test_a_change_by_another_station_is_in_the_history_with_its_address(path: Path) -> None:
-    vehicle = small_px4()
-    radio = Radio(vehicle)
+    vehicle = shell.small_px4()
+    radio = shell.Radio(vehicle)
     async with fetched(radio, cache=path) as (_, component):
         await asyncio.sleep(1.0)
         message = messages.ParamSet(1, 1, "PARAM_01", (55).to_bytes(4, "little"), 6)
@@ -372,11 +360,11 @@ async def test_a_value_announced_just_before_the_file_was_read_keeps_its_index(p
 
 async def test_a_cache_that_was_given_stays_open(path: Path) -> None:
     with ParamCache(path) as cache:
-        async with ParamClient(small_px4(), cache=cache) as client:
+        async with ParamClient(shell.small_px4(), cache=cache) as client:
             assert client.cache is cache
             await (await client.component()).fetch_all()
         assert len(cache.component().params) == 25
-    async with ParamClient(small_px4(), cache=path) as client:
+    async with ParamClient(shell.small_px4(), cache=path) as client:
         await client.component()
     assert client.cache is not None
     with pytest.raises(errors.CacheError, match="closed"):
@@ -385,7 +373,7 @@ async def test_a_cache_that_was_given_stays_open(path: Path) -> None:
 
 async def test_the_users_cache_is_used_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    async with ParamClient(small_px4(), cache=False) as client:
+    async with ParamClient(shell.small_px4(), cache=False) as client:
         assert client.cache is None
         component = await client.component()
         await component.fetch_all()
@@ -393,26 +381,26 @@ async def test_the_users_cache_is_used_by_default(tmp_path: Path, monkeypatch: p
         await asyncio.sleep(1.0)
     assert not any(tmp_path.iterdir())  # noqa: ASYNC240 - an empty folder
     for cache in (None, True):
-        async with ParamClient(small_px4(), cache=cache) as client:
+        async with ParamClient(shell.small_px4(), cache=cache) as client:
             assert client.cache is not None
             assert client.cache.path == tmp_path / "paramclient" / "parameters.sqlite3"
             assert (await (await client.component()).fetch_all()).source == ("cache" if cache else "stream")
 
 
 def test_a_folder_that_can_only_be_read(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    @in_simulated_time
+    @shell.in_simulated_time
     async def fill() -> None:
-        await session(small_px4(system=9), path)
+        await session(shell.small_px4(system=9), path)
 
-    @in_simulated_time
+    @shell.in_simulated_time
     async def use() -> None:  # in threads of its own, which have no powers of root
-        async with fetched(small_px4(), cache=path) as (_, component):
+        async with fetched(shell.small_px4(), cache=path) as (_, component):
             await component.set("PARAM_01", 5)
             await asyncio.sleep(20.0)
             assert (await component.get("PARAM_01")).value == 5
         [warning] = [record.getMessage() for record in caplog.records]
         assert warning.startswith("continuing without the cache: ")
-        assert (await session(small_px4(system=9), path)).source == "cache", "what can be read is used"
+        assert (await session(shell.small_px4(system=9), path)).source == "cache", "what can be read is used"
 
     fill()
     with read_only(path.parent):
@@ -457,7 +445,7 @@ async def test_vehicle_without_parameter_file_is_remembered_for_its_firmware(pat
         server.params = lambda: None
     else:
         vehicle.file_server = None
-    requested = Tap(vehicle)
+    requested = shell.Tap(vehicle)
     first = await session(requested, path)
     assert (first.source, first.complete) == ("stream", True)
     assert "Downloaded as a list" in first.notes[0]
@@ -514,7 +502,7 @@ def test_two_programs_share_vehicles_and_a_cache(tmp_path: Path) -> None:
         for vehicle in vehicles:
             cached = cache.component(system=vehicle.system)
             assert cached.complete
-            assert bits(cached.params) == bits(vehicle.params)
+            assert shell.bits(cached.params) == shell.bits(vehicle.params)
             for name, before, after in (("P_100", 100, 9), ("P_200", 200, 19)):
                 lines = cache.history(cached.key, name=name)
                 steps = [(line.old.value, line.new and line.new.value) for line in lines]
@@ -563,7 +551,7 @@ async def test_the_next_session_knows_extended_parameters(tmp_path: Path) -> Non
 async def test_a_camera_is_cached_with_its_vehicle(tmp_path: Path, is_first: bool) -> None:
     """A vehicle is its autopilot's hardware id; the camera has another one of its own."""
     path = tmp_path / "cache"
-    camera, autopilot = Camera(TABLE), small_px4()
+    camera, autopilot = Camera(TABLE), shell.small_px4()
     late = autopilot if is_first else camera
     for value in (200, 400):
         late.reboot(anyio.current_time(), down=math.inf)

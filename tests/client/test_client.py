@@ -31,22 +31,9 @@ from paramclient.client import link_task
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire import messages
+from tests import shell
 from tests.client.conftest import connected, fetched
 from tests.conversations.virtual import meanwhile, virtual_on_both
-from tests.shell import (
-    VALUES,
-    FlakyLink,
-    Tap,
-    a_client,
-    bits,
-    generic,
-    outcome,
-    residue,
-    settled,
-    small_px4,
-    tasks_beside,
-    until,
-)
 from tests.simulated_on_udp import flying
 
 Call = Callable[[ParamClient, Component], Coroutine[Any, Any, object]]
@@ -69,7 +56,7 @@ async def first_change(component: Component) -> Change:
 
 def under_way(client: ParamClient, component: Component) -> dict[str, asyncio.Task[object]]:
     """All calls, each in a task of its own."""
-    return {name: asyncio.create_task(outcome(call(client, component))) for name, call in CALLS.items()}
+    return {name: asyncio.create_task(shell.outcome(call(client, component))) for name, call in CALLS.items()}
 
 
 # Life and death
@@ -80,27 +67,27 @@ def under_way(client: ParamClient, component: Component) -> dict[str, asyncio.Ta
 )
 async def test_an_exception_of_the_body_is_raised_unchanged(error: BaseException) -> None:
     async def use() -> None:
-        async with a_client(generic()) as client:
+        async with shell.a_client(shell.generic()) as client:
             await client.component()
             raise error
 
     with pytest.raises(type(error)) as caught:
         await use()
     assert caught.value is error
-    assert not tasks_beside()
+    assert not shell.tasks_beside()
 
 
 async def test_a_time_limit_around_the_client_ends_it() -> None:
     with anyio.move_on_after(0.5) as scope:
-        async with a_client(generic()) as client:
+        async with shell.a_client(shell.generic()) as client:
             await client.component(system=99)
     assert scope.cancelled_caught
     await asyncio.sleep(1.0)
-    assert not tasks_beside()
+    assert not shell.tasks_beside()
 
 
 async def test_calls_on_a_client_that_is_not_open() -> None:
-    client = a_client(small_px4())
+    client = shell.a_client(shell.small_px4())
     for before in (client.component(), client.only_component(), client.fetch_all()):
         with pytest.raises(errors.ClientClosed, match="not open"):
             await before
@@ -111,7 +98,7 @@ async def test_calls_on_a_client_that_is_not_open() -> None:
         with pytest.raises(errors.ClientClosed, match="was closed"):
             await call
     assert len(component.params) == 25, "what was known stays readable"
-    assert not residue(component)
+    assert not shell.residue(component)
 
 
 LONG_CALLS: dict[str, Call] = {
@@ -125,7 +112,7 @@ LONG_CALLS: dict[str, Call] = {
 @pytest.mark.parametrize("call", LONG_CALLS)
 @virtual_on_both
 async def test_closing_ends_a_call_of_another_task_at_once(call: str) -> None:
-    client = await a_client(PX4Vehicle(burst=1, period=0.05)).open()
+    client = await shell.a_client(PX4Vehicle(burst=1, period=0.05)).open()
     component = await client.component()
     async with meanwhile(LONG_CALLS[call](client, component)) as raised:
         await anyio.sleep(1.0)
@@ -140,9 +127,9 @@ async def test_nothing_is_left_behind(tmp_path: Path) -> None:
     def present() -> tuple[set[str], int, set[threading.Thread]]:
         """The tasks, the open files, and the threads but those that anyio keeps for its event loop."""
         threads = {each for each in threading.enumerate() if "AnyIO worker" not in each.name}
-        return tasks_beside(), len(os.listdir("/dev/fd")), threads  # noqa: PTH208 - numbers, not paths
+        return shell.tasks_beside(), len(os.listdir("/dev/fd")), threads  # noqa: PTH208 - numbers, not paths
 
-    with flying(small_px4()) as url:
+    with flying(shell.small_px4()) as url:
         tasks, files, threads = present()
         for _ in range(2):
             async with fetched(url, cache=tmp_path / "cache") as (_, component):
@@ -156,7 +143,7 @@ async def test_nothing_is_left_behind(tmp_path: Path) -> None:
 
 
 async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
-    vehicle = small_px4()
+    vehicle = shell.small_px4()
     async with connected(vehicle) as (_, component):
         param = await component.get("_HASH_CHECK")
         assert (param.value, param.type, param.index) == (vehicle.announced_hash(), ParamType.UINT32, None)
@@ -175,9 +162,9 @@ async def test_a_px4_has_fewer_parameters_from_its_second_start_on() -> None:
 
 async def test_invalid_values_and_names_are_not_sent() -> None:
     table: dict[str, Any] = {"SMALL": (ParamType.UINT8, 1), "WHOLE": 1}
-    tap = Tap(GenericVehicle(table))
+    tap = shell.Tap(GenericVehicle(table))
     async with fetched(tap) as (_, component):
-        await settled()
+        await shell.settled()
         tap.received.clear()
         names = ("SEVENTEEN_LETTERS", "GRÖSSE", "")
         numbers = [("SMALL", 300), ("SMALL", -1), ("WHOLE", 1.5), ("WHOLE", 2**31), ("WHOLE", math.nan)]
@@ -191,9 +178,9 @@ async def test_invalid_values_and_names_are_not_sent() -> None:
             with pytest.raises(errors.UsageError):
                 await call
         assert (await component.set_many({})).is_complete
-        await settled()
+        await shell.settled()
         assert not tap.received
-        assert not residue(component)
+        assert not shell.residue(component)
 
 
 # Time-outs
@@ -201,7 +188,7 @@ async def test_invalid_values_and_names_are_not_sent() -> None:
 
 @pytest.mark.parametrize("timeout", [math.nan, -1.0, "1"])
 async def test_a_timeout_is_a_number_of_seconds(timeout: Any) -> None:
-    async with connected(generic()) as (client, component):
+    async with connected(shell.generic()) as (client, component):
         for call in (
             *(component.get("A", timeout=timeout), component.set("A", 1, timeout=timeout)),
             *(component.set_many({"A": 1}, timeout=timeout), component.fetch_all(timeout=timeout)),
@@ -212,7 +199,7 @@ async def test_a_timeout_is_a_number_of_seconds(timeout: Any) -> None:
 
 
 async def test_every_call_has_a_time_limit_of_its_own() -> None:
-    tap = Tap(generic())
+    tap = shell.Tap(shell.generic())
     async with connected(tap) as (_, component):
         await asyncio.sleep(0.1)
         tap.is_deaf = True
@@ -228,12 +215,12 @@ async def test_every_call_has_a_time_limit_of_its_own() -> None:
             error = caught.value
             assert error.awaited == awaited
             assert math.isclose(error.waited, 2.5, abs_tol=0.01), awaited
-            await settled()
-            assert not residue(component)
+            await shell.settled()
+            assert not shell.residue(component)
 
 
 async def test_a_fetch_that_times_out_returns_the_received_values() -> None:
-    slow = generic(burst=1, period=0.1)
+    slow = shell.generic(burst=1, period=0.1)
     async with connected(slow) as (client, component):
         seen: list[Progress] = []
         result = await component.fetch_all(timeout=1.05, progress=seen.append)
@@ -247,9 +234,9 @@ async def test_a_fetch_that_times_out_returns_the_received_values() -> None:
         assert result.missing == tuple(range(result.received, 24))
         assert result.notes == ("The fetch ended at its timeout.",)
         assert math.isclose(result.elapsed, 1.05, abs_tol=0.001)
-        assert list(result.params) == list(VALUES)[: result.received]
-        await settled()
-        assert not residue(component)
+        assert list(result.params) == list(shell.VALUES)[: result.received]
+        await shell.settled()
+        assert not shell.residue(component)
         both = await client.fetch_all(timeout=1.0)
         assert not both.complete
         assert both.results[1, 1].missing
@@ -263,20 +250,20 @@ async def test_a_fetch_that_times_out_returns_the_received_values() -> None:
 
 async def test_several_vehicles_are_fetched_side_by_side() -> None:
     vehicles: dict[tuple[int, int], Any] = {
-        (1, 1): small_px4(period=0.1, burst=1),
-        (1, 100): generic(
+        (1, 1): shell.small_px4(period=0.1, burst=1),
+        (1, 100): shell.generic(
             component=100, autopilot=messages.MAV_AUTOPILOT_INVALID, table={"ZOOM": 1, "FOCUS": 2.5}
         ),
-        (2, 1): generic(system=2, table={"OTHER": 7}),
+        (2, 1): shell.generic(system=2, table={"OTHER": 7}),
         (3, 1): ArduPilotVehicle(system=3),
     }
-    async with a_client(Air(list(vehicles.values()))) as client:
+    async with shell.a_client(Air(list(vehicles.values()))) as client:
         everything = await client.fetch_all()
         assert everything.complete
         assert not everything.silent
         assert everything.results.keys() == vehicles.keys()
         for address, result in everything.results.items():
-            assert bits(result.params) == bits(vehicles[address].params)
+            assert shell.bits(result.params) == shell.bits(vehicles[address].params)
             assert client.components[address].params == result.params
         assert (await client.fetch_all(1, refresh=True)).results.keys() == {(1, 1), (1, 100)}
         await client.components[3, 1].set("RTL_ALT", 1234)
@@ -284,9 +271,9 @@ async def test_several_vehicles_are_fetched_side_by_side() -> None:
         assert vehicles[3, 1].param("RTL_ALT").value == 1234
 
 
-def silent(**options: Any) -> Tap:
+def silent(**options: Any) -> shell.Tap:
     """A component that sends heartbeats and nothing else."""
-    tap = Tap(generic(**options))
+    tap = shell.Tap(shell.generic(**options))
     tap.is_deaf = True
     return tap
 
@@ -294,7 +281,7 @@ def silent(**options: Any) -> Tap:
 @pytest.mark.parametrize("autopilot", [messages.MAV_AUTOPILOT_GENERIC, messages.MAV_AUTOPILOT_INVALID])
 async def test_a_silent_component_delays_no_other_component(autopilot: int) -> None:
     parts = [silent(**at, autopilot=autopilot) for at in ({"component": 100}, {"system": 2})]
-    async with a_client(Air([*parts, generic()])) as client:
+    async with shell.a_client(Air([*parts, shell.generic()])) as client:
         component = await client.component(system=1, component=1)
         with anyio.fail_after(0.5):
             assert (await component.fetch_all()).complete
@@ -307,28 +294,30 @@ async def test_a_silent_component_delays_no_other_component(autopilot: int) -> N
             assert "sends messages" in str(error)
         assert everything.complete
         assert (await component.get("PARAM_01")).value == 1
-        assert not any(residue(each) for each in client.components.values())
+        assert not any(shell.residue(each) for each in client.components.values())
 
 
 @pytest.mark.parametrize("delay", [1.25, 0.0], ids=["far away", "heard late"])
 async def test_fetch_all_waits_for_a_second_vehicle(delay: float) -> None:
-    second = generic(system=2)
+    second = shell.generic(system=2)
     if not delay:
         second.reboot(1000.0, down=0.9)
-    async with a_client(Air([generic(), Air.symmetric([second], delay=delay)])) as client:
-        await until(lambda: (2, 1) in client.components or not delay)
+    async with shell.a_client(Air([shell.generic(), Air.symmetric([second], delay=delay)])) as client:
+        await shell.until(lambda: (2, 1) in client.components or not delay)
         assert (await client.fetch_all()).results.keys() == {(1, 1), (2, 1)}
 
 
 async def test_fetch_all_waits_for_a_px4_that_is_starting() -> None:
     starting = silent(system=2, autopilot=messages.MAV_AUTOPILOT_PX4)
-    async with a_client(Air([generic(), starting])) as client:
+    async with shell.a_client(Air([shell.generic(), starting])) as client:
         asyncio.get_running_loop().call_later(4.0, setattr, starting, "is_deaf", False)
         assert (await client.fetch_all()).results.keys() == {(1, 1), (2, 1)}
 
 
 async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
-    async with a_client(generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)) as client:
+    async with shell.a_client(
+        shell.generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
+    ) as client:
         assert (await client.fetch_all()).results.keys() == {(1, 100)}
         assert (await client.fetch_all(1)).results.keys() == {(1, 100)}
         with pytest.raises(errors.NoReply, match="system 2"):
@@ -337,15 +326,15 @@ async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
 
 async def test_a_vehicle_that_answers_nothing_ends_a_fetch_within_7_s() -> None:
     for options in ({}, {"component": 100, "autopilot": messages.MAV_AUTOPILOT_INVALID}):
-        async with a_client(silent(**options)) as client:
+        async with shell.a_client(silent(**options)) as client:
             await asyncio.sleep(1.5)
             with pytest.raises(errors.NoReply, match="answers no request"), anyio.fail_after(7.0):
                 await client.fetch_all()
 
 
 async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:
-    tap = Tap(generic())
-    async with a_client(tap) as client:
+    tap = shell.Tap(shell.generic())
+    async with shell.a_client(tap) as client:
         await client.component()
         tap.is_deaf = True
         fetch = asyncio.create_task(client.fetch_all())
@@ -358,7 +347,7 @@ async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:
 
 
 async def test_changes_have_the_old_and_the_new_value() -> None:
-    vehicle = small_px4()
+    vehicle = shell.small_px4()
     async with connected(vehicle) as (_, component):
         first, second = component.changes(), component.changes()
 
@@ -368,7 +357,7 @@ async def test_changes_have_the_old_and_the_new_value() -> None:
 
         await component.get("PARAM_01")
         vehicle.set_param("PARAM_01", 40)
-        await until(lambda: component.params["PARAM_01"].value == 40)
+        await shell.until(lambda: component.params["PARAM_01"].value == 40)
         assert await told(first) == ("PARAM_01", None, 40, "vehicle"), "two unread changes have become one"
         await component.set("PARAM_01", 41)
         assert await told(first) == ("PARAM_01", 40, 41, "us")
@@ -379,8 +368,8 @@ async def test_changes_have_the_old_and_the_new_value() -> None:
 
 
 async def test_calls_go_on_when_the_link_is_back() -> None:
-    vehicle = generic(burst=1, period=0.1)
-    link = FlakyLink(vehicle)
+    vehicle = shell.generic(burst=1, period=0.1)
+    link = shell.FlakyLink(vehicle)
     async with connected(link) as (client, component):
         changes = component.changes()
         fetch = asyncio.create_task(component.fetch_all())
@@ -395,21 +384,21 @@ async def test_calls_go_on_when_the_link_is_back() -> None:
         assert (await read).value == 20
         assert (await write).status == "accepted"
         assert (await fetch).complete
-        assert bits(component.params) == bits(vehicle.params)
+        assert shell.bits(component.params) == shell.bits(vehicle.params)
         assert (await anext(changes)).name == "PARAM_00"
         assert "open" in repr(client)
-        assert not residue(component)
+        assert not shell.residue(component)
 
 
 async def test_a_link_that_stays_disconnected_fails_only_calls(caplog: pytest.LogCaptureFixture) -> None:
-    tap = Tap(generic())
-    link = FlakyLink(tap)
+    tap = shell.Tap(shell.generic())
+    link = shell.FlakyLink(tap)
     async with connected(link) as (client, component):
         tap.is_mute = True
         waiting = under_way(client, component)
-        await settled()
+        await shell.settled()
         changes, events = waiting.pop("changes"), waiting.pop("client.events")
-        limited = asyncio.create_task(outcome(component.get("PARAM_05", timeout=2)))
+        limited = asyncio.create_task(shell.outcome(component.get("PARAM_05", timeout=2)))
         await link.drop(stays_offline=True)
         disconnected_at = anyio.current_time()
         assert isinstance(await limited, errors.NoReply)
@@ -421,7 +410,7 @@ async def test_a_link_that_stays_disconnected_fails_only_calls(caplog: pytest.Lo
         for call in ("get", "set", "fetch_all", "client.component", "client.fetch_all"):
             with pytest.raises(errors.LinkError, match="refused"):
                 await CALLS[call](client, component)
-        assert not residue(component)
+        assert not shell.residue(component)
         await asyncio.sleep(30.0)
         attempts = link.openings
         await asyncio.sleep(30.0)
@@ -445,7 +434,7 @@ NEW: dict[str, int | float] = {name: value + 0.5 for name, value in MANY.items()
 
 
 async def test_the_timeout_is_that_of_the_whole_call() -> None:
-    tap = Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
+    tap = shell.Tap(Air.symmetric([PX4Vehicle(table=MANY)], delay=0.05))
     async with fetched(tap) as (_, component):
         result = await component.set_many(NEW, timeout=0.25)
         assert 0.2 < result.elapsed < 0.4
@@ -453,7 +442,7 @@ async def test_the_timeout_is_that_of_the_whole_call() -> None:
         assert result.counts[SetStatus.ACCEPTED] >= 10
         assert result.counts[SetStatus.UNKNOWN] >= 10
         assert result.counts[SetStatus.NOT_TRIED] >= 100
-        assert not residue(component)
+        assert not shell.residue(component)
         sent = len(tap.messages(messages.ParamSet))
         await asyncio.sleep(1.0)
         assert len(tap.messages(messages.ParamSet)) == sent
@@ -497,7 +486,7 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
             with anyio.move_on_after(seconds if how == "scope" else None) as scope:
                 async with connected(air) as (_, component):
                     if how == "error":
-                        fetching = asyncio.ensure_future(outcome(component.fetch_all()))
+                        fetching = asyncio.ensure_future(shell.outcome(component.fetch_all()))
                         await anyio.sleep(seconds)
                         assert not fetching.done()
                         raise RuntimeError("of the body")
@@ -514,7 +503,7 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
             await asyncio.wait([task])
         assert task.cancelled() == how.endswith(("task", "tasks"))
         assert task.cancelled() or bool(task.exception()) == (how == "error")
-        assert not tasks_beside()
+        assert not shell.tasks_beside()
         if how == "all tasks":  # the vehicle ends its burst before it closes
             await anyio.sleep(1.0)
             air.tick(anyio.current_time())
@@ -524,7 +513,7 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
 
 
 async def test_a_read_goes_on_when_the_link_is_back() -> None:
-    link = FlakyLink(with_files())
+    link = shell.FlakyLink(with_files())
     async with connected(link) as (_, component):
         reading = asyncio.ensure_future(component.read_file("/APM/LOGS/1.BIN"))
         await anyio.sleep(0.3)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
+from functools import partial
 
 import anyio
 import pytest
@@ -16,7 +18,8 @@ from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire import messages
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
-from tests.conversations.virtual import QUIET, Puppet, Tap, meanwhile, talking, virtual_on_both
+from tests.conversations.virtual import QUIET, Puppet, Tap, losing, meanwhile, talking, virtual_on_both
+from tests.shell import Eventful
 
 ARDUPILOT = messages.Heartbeat(2, 3, system_status=4)
 PX4 = messages.Heartbeat(2, 12, system_status=4)
@@ -225,6 +228,14 @@ async def test_an_unknown_name_of_a_px4_without_hash_is_unknown(serves: tuple[st
         assert anyio.current_time() < 15.0
 
 
+async def test_a_misspelt_name_costs_seconds_where_others_are_answered() -> None:
+    async with talking(Air.symmetric([PX4Vehicle()], delay=0.15)) as (_, session):
+        await read(session, "MC_ROLL_P")
+        with pytest.raises(errors.UnknownParameter):
+            await read(session, "NOPE")
+        assert anyio.current_time() < 10.0
+
+
 async def test_an_unknown_name_beside_a_fetch_costs_no_list_of_its_own() -> None:
     vehicle = PX4Vehicle()
     async with talking(Air.symmetric([vehicle], delay=0.05)) as (_, session):
@@ -256,6 +267,52 @@ async def test_a_known_parameter_that_a_list_lost_is_not_unknown() -> None:
         lost.add("NODE_ID")
         with pytest.raises(errors.NoReply):
             await read(session, "NODE_ID")
+
+
+async def test_a_parameter_is_not_unknown_where_the_list_was_cut_off() -> None:
+    vehicle = Partial(serves=("list",))
+
+    def down(message: messages.Message) -> bool:
+        is_first = vehicle.number_of(messages.ParamRequestList) == 1
+        return not isinstance(message, messages.ParamValue) or (is_first and message.param_index < 3)
+
+    async with talking(Air.symmetric([Tap(vehicle, down=down)])) as (_, session):
+        with pytest.raises(errors.NoReply):
+            await read(session, "MODE")
+
+
+async def test_a_component_with_one_parameter_and_no_list_is_fetched() -> None:
+    async with talking(Partial({"A": (5, ParamType.INT32)}, serves=("indices",))) as (_, session):
+        assert (await fetch_all(session)).complete
+
+
+async def test_late_acknowledgements_in_another_type_are_no_new_type() -> None:
+    vehicle = Partial(serves=("names", "sets", "commands"))
+    ack = messages.ParamValue("MODE", struct.pack("<i", 9), ParamType.REAL32, 8, 5)
+    late = Eventful(vehicle, *((at, partial(vehicle.say, ack)) for at in (0.9, 1.1)))
+    async with talking(Air.symmetric([late], delay=0.15)) as (_, session):
+        assert (await write(session, "MODE", 9)).status == "accepted"
+    assert vehicle.values["MODE"] == ack.raw
+
+
+async def test_a_list_ends_while_others_poll_a_parameter() -> None:
+    vehicle = PX4Vehicle()
+    request = messages.encode(messages.ParamRequestRead(1, 1, "", 400), system=254, component=190, sequence=5)
+    up = losing(1, lambda message: isinstance(message, messages.ParamRequestList))
+    poll = partial(vehicle.receive, request, 0.0)
+    polled = Eventful(Tap(vehicle, up=up), *((at / 5, poll) for at in range(200)))
+    async with talking(Air.symmetric([polled], delay=0.01)) as (_, session):
+        assert (await fetch_all(session)).complete
+        assert anyio.current_time() < 20.0
+
+
+async def test_the_answer_to_a_control_read_is_none_to_another_read() -> None:
+    vehicle = Partial(serves=("list", "indices", "sets", "acks", "commands"))
+    async with talking(Air.symmetric([vehicle], delay=0.05)) as (_, session):
+        async with meanwhile(read(session, "GAIN_0")) as outcomes:
+            await anyio.sleep(0.5)
+            await read(session, "GAIN_1")
+        assert outcomes[0].param_id == "GAIN_0"
 
 
 @pytest.mark.parametrize("heartbeat", [ARDUPILOT, QUIET, PX4], ids=["AP", "generic", "PX4"])
