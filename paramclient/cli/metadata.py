@@ -108,7 +108,7 @@ async def _stored(session: CommandSession, *, added_only: bool = False) -> Metad
 def known_of_sets(
     sets: Sequence[ParamSet], options: CacheOptions | LinkOptions, given: Metadata | None
 ) -> list[Metadata | None]:
-    """Return the given metadata, else what is stored for the firmware of each set, or of another set."""
+    """Return the given metadata, else that of each set's firmware; see `MetadataStore.known_of_sets`."""
     if given is not None or options.no_cache:
         return [given] * len(sets)
     return MetadataStore.beside(ParamCache(options.cache).path).known_of_sets(sets)

@@ -7,7 +7,7 @@ import logging
 import lzma
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -219,14 +219,17 @@ class MetadataStore:
         """
         return self._cached(identity, component) or self.added.find(identity, component)
 
-    def known_of_sets(self, sets: Iterable[ParamSet]) -> list[Metadata | None]:
-        """Return the metadata of each set's firmware; for a set without identity, that of another set."""
+    def known_of_sets(self, sets: Sequence[ParamSet]) -> list[Metadata | None]:
+        """Return the known metadata of each set's firmware; for a set without identity, that of another."""
         own = [
             None if each.identity is None else self.known(each.identity, each.component or AUTOPILOT)
             for each in sets
         ]
         first = next(filter(None, own), None)
-        return [first if each is None else each for each in own]
+        return [
+            first if known is None and each.identity is None else known
+            for known, each in zip(own, sets, strict=True)
+        ]
 
     def _cached(self, identity: Identity, component: int) -> Metadata | None:
         note = self._note(identity, component)

@@ -221,9 +221,8 @@ def test_two_links_are_compared(command: Command, monkeypatch: pytest.MonkeyPatc
     }
     outcome = command("diff", "tcp:one:1", "tcp:two:1", "--base", "tcp:one:1", "--json")
     assert (outcome.code, outcome.err) == (1, "")
-    assert [
-        (entry["left"]["value"], entry["right"]["value"]) for entry in outcome.json["params"].values()
-    ] == [(2, 3)]
-    assert outcome.json["params"]["B"]["changed_side"] == "right"
+    [(name, entry)] = outcome.json["params"].items()
+    values = entry["left"]["value"], entry["right"]["value"]
+    assert (name, values, entry["changed_side"]) == ("B", (2, 3), "right")
     assert (outcome.json["left"]["system"], outcome.json["right"]["system"]) == (1, 7)
     assert outcome.json["right"]["source"] == "link tcp:two:1"

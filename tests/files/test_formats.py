@@ -577,10 +577,7 @@ def test_an_invalid_field_is_rejected(fields: str, problem: str) -> None:
         ('{"paramclient": 1, "sets": [{"at": "2026-02-31T12:00:00Z", "params": {}}]}', "found '2026-02-31"),
         ('{"paramclient": 1, "sets": [{"system": 256, "params": {}}]}', "sets.0.system"),
         ('{"paramclient": 1, "sets": [{"params": {"": {"value": 1}}}]}', "at least one character"),
-        (
-            '{"paramclient": 1, "sets": [{"params": {"A": {"value": 1}, "A": {"value": 1}}}]}',
-            "'A' occurs twice",
-        ),
+        ('{"paramclient": 1, "sets": [{"params": {"A": {}, "A": {}}}]}', "'A' occurs twice"),
         ('{"a":' * 100_000, "nested too deep"),
         ('{"A": %s}' % ("9" * 5000), "not a parameter file of paramclient"),
         ('{"paramclient": 1, "sets": [{"at": "9999-12-31T23:59:59.9999999Z", "params": {}}]}', "not a valid"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from paramclient import FileError, UsageError
+from paramclient import FileError, ParamSet, UsageError
 from paramclient.metadata import AddedFiles, Metadata, MetadataStore
 from paramclient.model.identity import Identity
 from paramclient.model.px4_hash import crc32_px4
@@ -95,3 +95,10 @@ def test_a_store_prefers_what_the_vehicle_has_provided(tmp_path: Path) -> None:
     assert shown(store.known(identity, 1)) == 9
     store.keep({crc32_px4(own): own}, identity, 1, crc32_px4(own))
     assert shown(store.known(identity, 1)) == 8
+
+
+def test_only_a_set_without_identity_takes_the_metadata_of_another(tmp_path: Path) -> None:
+    store = MetadataStore(tmp_path / "metadata")
+    store.added.add(described(tmp_path, "ArduCopter", 7))
+    sets = [ParamSet({}, identity=each) for each in (replace(COPTER, vehicle_type=10), COPTER, None)]
+    assert [*map(shown, store.known_of_sets(sets))] == [None, 7, 7]
