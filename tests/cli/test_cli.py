@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -402,10 +403,8 @@ def test_ctrl_c_during_a_fetch_says_what_was_received_and_kept(
     done = command("fetch", put(vehicle), *cache)
     assert (done.code, done.out) == (130, "")
     where = "kept in the cache" if kept else "not kept, without a cache"
-    found = re.fullmatch(
-        rf"interrupted: ([0-9]+) of 903 parameters of 1/1 px4 received and {where}\n", done.err
-    )
-    assert found
+    said = rf"interrupted: ([0-9]+) of 903 parameters of 1/1 px4 received and {where}\n"
+    assert (found := re.fullmatch(said, done.err))
     if kept:
         assert command("cache", "list", *cache, "--json").json["components"][0]["size"] == int(found[1]) > 0
 
@@ -442,6 +441,14 @@ def test_a_closed_pipe_ends_the_command_silently(warm: Path) -> None:
         assert (outcome.code, outcome.err) == (code, "")
 
 
+@pytest.mark.parametrize("closed", range(3))
+def test_a_command_runs_without_a_standard_stream(closed: int) -> None:
+    words = ("reset", "sim:ardupilot", "RELAY1_FUNCTION", "--no-cache")
+    done = run_process(*words, preexec_fn=partial(os.close, closed))
+    shown = ("accepted" in done.out, "writing to 1/1" in done.err)
+    assert (done.code, *shown) == (0, closed != 1, closed != 2), done.err
+
+
 def test_a_full_disk_is_reported(warm: Path) -> None:
     with Path("/dev/full").open("w") as full:
         outcome = run_process("show", "--json", "--cache", warm, stdout=full)
@@ -463,10 +470,8 @@ def test_without_the_extra_the_message_names_it() -> None:
     outcome = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT
     )
-    assert (outcome.returncode, outcome.stdout) == (2, "")
-    assert outcome.stderr == (
-        "paramclient: the command needs cyclopts and rich: pip install 'paramclient[cli]'\n"
-    )
+    needs = "paramclient: the command needs cyclopts and rich: pip install 'paramclient[cli]'\n"
+    assert (outcome.returncode, outcome.stdout, outcome.stderr) == (2, "", needs)
 
 
 def test_rich_and_the_simulators_load_only_if_needed() -> None:
@@ -477,9 +482,8 @@ def test_rich_and_the_simulators_load_only_if_needed() -> None:
 def test_the_help_of_fetch_fits_on_a_screen_with_the_connection_last() -> None:
     lines = run_process("fetch", "--help", env={**PLAIN, "COLUMNS": "80"}).out.splitlines()
     assert len(lines) <= 50
-    assert [line.split()[1] for line in lines if line.startswith("╭")] == [
-        *("Arguments", "Parameters", "Connection")
-    ]
+    groups = [line.split()[1] for line in lines if line.startswith("╭")]
+    assert groups == ["Arguments", "Parameters", "Connection"]
 
 
 def test_help_wraps_at_the_terminal_and_has_no_examples_of_other_subcommands() -> None:
@@ -536,12 +540,10 @@ def test_text_from_the_wire_is_escaped(command: Command, put: Put, tmp_path: Pat
 
 def on_terminal(*arguments: object, **environment: str) -> Outcome:
     """Run the command line with stdout and stderr on one terminal."""
-    ours, theirs = pty.openpty()
-    printed = b""
+    (ours, theirs), printed = pty.openpty(), b""
     try:
-        with process(
-            *arguments, stdout=theirs, stderr=theirs, env={**PLAIN, "TERM": "xterm", **environment}
-        ) as started:
+        env = {**PLAIN, "TERM": "xterm", **environment}
+        with process(*arguments, stdout=theirs, stderr=theirs, env=env) as started:
             os.close(theirs)
             # the terminal ends when the last process closes it
             while select.select([ours], [], [], TIMEOUT)[0]:
