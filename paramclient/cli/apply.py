@@ -185,7 +185,7 @@ async def _from_file(
         params = choose(file, session.choice.component, session.component.system)
         own, origin = session.component.identity, params.identity
         has_uid = origin is not None and origin.uid is not None
-        header = file.header if len(file.sets) == 1 else ()  # that of several vehicles names all of them
+        header = file.header if len({each.system for each in file.sets}) == 1 else ()  # else of several
         is_named = own.uid and any(own.uid in each for each in (params.source, *header))
         if own.uid and not has_uid and (session.choice.uid or is_named):
             params = replace(params, identity=replace(origin or own, uid=own.uid))

@@ -146,8 +146,8 @@ class CommandSession:
 
     @property
     def others(self) -> list[str]:
-        """Other vehicles of the link in words, if --vehicle did not choose the one that is used."""
-        heard = self.client.autopilots if self.options.vehicle is None else []
+        """Other vehicles of the link in words, where --vehicle chose none; none beside a write."""
+        heard = [] if self.writes or self.options.vehicle is not None else self.client.autopilots
         return [node_in_words(each.node) for each in heard if each.node is not self.component.node]
 
     @property

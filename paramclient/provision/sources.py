@@ -266,7 +266,7 @@ def fetched_set(component: Component, result: FetchResult, *, source: str, parti
     if missing and not partial:
         who = f"{component.system}/{component.component} {component.autopilot} on {component.identity.link}"
         was = f"{first_of(missing, NAMES_SHOWN_MAX)} {'was' if len(missing) == 1 else 'were'} not received"
-        raise _incomplete(f"{who} is incomplete: {was}", component.system, component.component)
+        raise _incomplete(who, was, component.system, component.component)
     known = [name for name in result.params if name not in result.cached]
     return part_set(component, [result.params[name] for name in known], source, missing)
 
@@ -277,13 +277,15 @@ def part_set(component: Component, params: Collection[Param], source: str, lacks
     table = component.session.table
     twice = [f"a second {name}" for name, number in Counter(table.names.values()).items() if number > 1]
     names = [*lacks, *map(repr, sorted(table.left_out)), *twice]
-    kept = sum(param.index is not None for param in params)
-    words = f"{kept} of {component.count} parameters, without {first_of(names, NAMES_SHOWN_MAX)}"
+    size, count = len(params), component.count or 0
+    # of a list whose count has changed, indices may be those of the earlier one; an acknowledgement has none
+    of = f" of {count} parameters," if size + len(names) <= count else f" parameters; of the list of {count}"
+    words = f"{size}{of} without {first_of(names, NAMES_SHOWN_MAX)}"
     return component_set(component, params, source, words if names else "")
 
 
-def _incomplete(what: str, system: int, component: int) -> VehicleError:
-    return VehicleError(f"{what}; save and diff take it with --incomplete", system, component)
+def _incomplete(who: str, what: str, *ids: int) -> VehicleError:
+    return VehicleError(f"{who} is incomplete: {what}; save and diff take it with --incomplete", *ids)
 
 
 def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> ParamSet:
@@ -299,8 +301,7 @@ def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> Par
         lacks = f"{table.size - others}{of} parameters are in the cache"
         lacks += f", and {others} read by name" if others else ""
         if not partial:
-            message = f"{table.system}/{table.component} is incomplete: {lacks}"
-            raise _incomplete(message, table.system, table.component)
+            raise _incomplete(f"{table.system}/{table.component}", lacks, table.system, table.component)
     at, source = table.updated_at if table.synced_at is None else table.synced_at, f"cache {table.key}"
     return ParamSet(table.params, table.component, table.system, table.identity, at, source, extended, lacks)
 

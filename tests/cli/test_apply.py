@@ -228,15 +228,15 @@ def test_a_backup_restores_the_calibration_of_the_very_same_vehicle(
     anonymous = file("".join(line for line in text.splitlines(keepends=True) if line[0] != "#"))
     rows = "".join(f"{system}\t1\tCOMPASS_OFS_X\t5\t9\n" for system in (1, 2))
     several = file(f"# {named.stem} and another vehicle\n{rows}", "several.params")
+    two = file(f"# {named.stem}\n1\t1\tCOMPASS_OFS_X\t5\t9\n1\t154\tA\t1\t9\n", "two.params")  # components
     vehicle.set_param("COMPASS_OFS_X", 9.0)
     for foreign in (anonymous, several):
         left_out = command("restore", put(vehicle), foreign)
         assert (left_out.code, " of 1/? from" in left_out.err) == (0, False)
-        assert (
-            "1/1 ardupilot: left out: 1 calibration; to write them: --include calibration\n" in left_out.err
-        )
+        said = "1/1 ardupilot: left out: 1 calibration; to write them: --include calibration\n"
+        assert said in left_out.err
         assert vehicle.values["COMPASS_OFS_X"] == 9.0
-    for words in ([named], [copied], [anonymous, "--vehicle", f"uid:{named.stem}"]):
+    for words in ([named], [copied], [two], [anonymous, "--vehicle", f"uid:{named.stem}"]):
         vehicle.set_param("COMPASS_OFS_X", 9.0)
         assert "restore writes this vehicle's own calib" in command("apply", put(vehicle), *words).err
         assert command("restore", put(vehicle), *words).code == 0

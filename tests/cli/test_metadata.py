@@ -42,9 +42,8 @@ def copter(system: int = 1) -> ArduPilotVehicle:
 
 def test_set_accepts_value_names_of_the_vehicle(command: Command, put: Put) -> None:
     vehicle = quad()
-    done = command(
-        "set", put(vehicle), "COM_FLTMODE1=return", "EKF2_GPS_CTRL=Position|Heading", "--json", "--no-cache"
-    )
+    words = ("COM_FLTMODE1=return", "EKF2_GPS_CTRL=Position|Heading", "--json", "--no-cache")
+    done = command("set", put(vehicle), *words)
     assert (done.code, done.err) == (0, "")
     assert vehicle.values["COM_FLTMODE1"] == 5
     assert vehicle.values["EKF2_GPS_CTRL"] == 9

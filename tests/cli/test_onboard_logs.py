@@ -31,6 +31,8 @@ def test_logs_of_every_format_are_compared(command: Command, tmp_path: Path) -> 
     assert outcome.json["left"]["at"].startswith("2026-11-20"), "when the values were received"
     assert len(command("show", telemetry, "--json").json["components"][0]["params"]) == 903
     assert "(incomplete: 23 of 908 parameters, " in command("show", DATA / "px4_20_sets.tlog").err
+    changed = command("show", DATA / "ardupilot_enable_groups.tlog").err
+    assert "(incomplete: 1402 parameters; of the list of 1382 without index 0, " in changed
     saved = command("save", telemetry, tmp_path / "quad.param")
     assert (saved.code, saved.err[:16]) == (0, "903 parameters o")
 

@@ -27,24 +27,12 @@ from paramclient import (
 from paramclient.model.values import Value
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.wire import messages
+from tests import shell
 from tests.client.conftest import connected, fetched, table_in
 from tests.conversations.test_fetch import new_vehicle
 from tests.conversations.test_writes import free_names
 from tests.conversations.virtual import Silence
 from tests.conversations.virtual import Tap as Filter
-from tests.shell import (
-    VALUES,
-    FlakyLink,
-    Tap,
-    a_client,
-    bits,
-    generic,
-    outcome,
-    residue,
-    settled,
-    small_px4,
-    until,
-)
 
 VOLATILE = {"CAL_ACC0_XOFF", "PARAM_03"}
 TIME_MAX = 7.0
@@ -65,16 +53,16 @@ def resynced(component: Component, changed: tuple[str, ...], vehicle: PX4Vehicle
     return Event(component, "resynced", changed=changed, hash=vehicle.announced_hash())
 
 
-def requested(tap: Tap) -> int:
+def requested(tap: shell.Tap) -> int:
     """All requests to the vehicle that concern parameters."""
     return sum(len(tap.messages(kind)) for kind in MISSES)
 
 
-def hashes(tap: Tap) -> int:
+def hashes(tap: shell.Tap) -> int:
     return sum(each.param_id == messages.HASH_CHECK for each in tap.messages(messages.ParamRequestRead))
 
 
-async def away(tap: Tap, seconds: float) -> None:
+async def away(tap: shell.Tap, seconds: float) -> None:
     tap.is_mute = tap.is_deaf = True
     await asyncio.sleep(seconds)
     tap.is_mute = tap.is_deaf = False
@@ -84,7 +72,7 @@ async def away(tap: Tap, seconds: float) -> None:
 
 
 async def test_an_update_that_was_lost_is_reported_within_one_interval() -> None:
-    tap = Tap(vehicle := small_px4())
+    tap = shell.Tap(vehicle := shell.small_px4())
     async with fetched(tap, watch_interval=10.0) as (client, component):
         await asyncio.sleep(1.0)
         events, changes = client.events(), component.changes()
@@ -101,13 +89,13 @@ async def test_an_update_that_was_lost_is_reported_within_one_interval() -> None
         assert anyio.current_time() - began <= 10.5
         assert component.sync_state is SyncState.SYNCED
         assert component.state is ComponentState.SYNCED
-        assert bits(component.params) == bits(vehicle.params)
-        assert not residue(component)
+        assert shell.bits(component.params) == shell.bits(vehicle.params)
+        assert not shell.residue(component)
 
 
 async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
-    px4, ardupilot = Tap(small_px4()), Tap(ArduPilotVehicle(table=VALUES, system=2))
-    async with a_client(Air([px4, ardupilot])) as client:
+    px4, ardupilot = shell.Tap(shell.small_px4()), shell.Tap(ArduPilotVehicle(table=shell.VALUES, system=2))
+    async with shell.a_client(Air([px4, ardupilot])) as client:
         await client.component(2)
         await client.fetch_all()
         await asyncio.sleep(1.0)
@@ -122,7 +110,7 @@ async def test_by_default_a_hash_is_watched_and_a_list_is_not() -> None:
 @pytest.mark.parametrize("ftp", [True, False])
 async def test_parameters_that_appear_and_go_do_so_in_the_cache_too(path: Path, ftp: bool) -> None:
     group = {f"GRIP_{number}": number for number in range(5)}
-    table = {**VALUES, "GRIP_ENABLE": 0}
+    table = {**shell.VALUES, "GRIP_ENABLE": 0}
     vehicle = ArduPilotVehicle(table=table, groups={"GRIP_ENABLE": group}, ftp=ftp, live=())
     async with fetched(vehicle, cache=path) as (_, component):
         changes = component.changes()
@@ -132,7 +120,7 @@ async def test_parameters_that_appear_and_go_do_so_in_the_cache_too(path: Path, 
                 assert (await component.set("GRIP_2", 20)).status == "accepted"
             await asyncio.sleep(3.0)
             assert component.sync_state is SyncState.SYNCED
-            assert bits(component.params) == bits(vehicle.params)
+            assert shell.bits(component.params) == shell.bits(vehicle.params)
             reported = [await anext(changes) for _ in range(6)]
             assert ("changed", "GRIP_ENABLE") in {(each.kind, each.name) for each in reported}
             kind = "added" if is_enabled else "removed"
@@ -145,7 +133,7 @@ async def test_parameters_that_appear_and_go_do_so_in_the_cache_too(path: Path, 
 
 
 async def test_an_armed_vehicle_is_asked_only_after_a_sign_of_change() -> None:
-    tap = Tap(vehicle := PX4Vehicle())
+    tap = shell.Tap(vehicle := PX4Vehicle())
     async with fetched(tap, watch_interval=5.0) as (_, component):
         vehicle.armed = True
         await anyio.sleep(6.5)
@@ -162,14 +150,14 @@ async def test_an_armed_vehicle_is_asked_only_after_a_sign_of_change() -> None:
 
 @pytest.mark.parametrize(
     ("make", "name", "seconds", "interval"),
-    [(generic, "PARAM_03", 35.0, 30.0), (PX4Vehicle, "CAL_MAG0_XOFF", 160.0, None)],
+    [(shell.generic, "PARAM_03", 35.0, 30.0), (PX4Vehicle, "CAL_MAG0_XOFF", 160.0, None)],
     ids=["by downloads, if the user wants it", "outside a hash, every two minutes"],
 )
 async def test_what_no_hash_confirms_is_watched(
     make: Callable[[], Vehicle], name: str, seconds: float, interval: float | None
 ) -> None:
     """The vehicle's announcement of the new value was lost."""
-    tap = Tap(vehicle := make())
+    tap = shell.Tap(vehicle := make())
     async with fetched(tap, watch_interval=interval) as (client, component):
         events = client.events()
         tap.is_mute = True
@@ -194,7 +182,7 @@ async def test_a_table_that_is_known_to_differ_is_not_called_synced_while_it_is_
 
 
 async def test_a_list_for_another_station_is_taken_and_restarts_nothing() -> None:
-    tap = Tap(vehicle := small_px4())
+    tap = shell.Tap(vehicle := shell.small_px4())
     async with fetched(tap, watch_interval=0) as (_, component):
         vehicle.load({"PARAM_01": 1001})
         before = requested(tap)
@@ -215,7 +203,7 @@ def test_intervals_and_policies_that_cannot_be() -> None:
 
 
 async def test_lost_and_found() -> None:
-    tap = Tap(vehicle := small_px4())
+    tap = shell.Tap(vehicle := shell.small_px4())
     async with fetched(tap, watch_interval=5.0) as (client, component):
         events = client.events()
         tap.is_mute = tap.is_deaf = True
@@ -246,31 +234,31 @@ async def test_lost_and_found() -> None:
 
 @pytest.mark.parametrize("seconds", [2.0, 8.0])
 async def test_a_link_that_was_disconnected_is_checked_like_a_loss(seconds: float) -> None:
-    vehicle = small_px4()
-    link = FlakyLink(Air.symmetric([vehicle], delay=0.05))
+    vehicle = shell.small_px4()
+    link = shell.FlakyLink(Air.symmetric([vehicle], delay=0.05))
     async with fetched(link) as (client, component):
         events = client.events()
         await link.drop(stays_offline=True)
         vehicle.set_param("PARAM_01", 1001)
         await asyncio.sleep(seconds)
         link.is_offline = False
-        await until(lambda: component.state == "cached")
+        await shell.until(lambda: component.state == "cached")
         assert component.sync_state is SyncState.CHECKING
         assert component.params["PARAM_05"].trust is Trust.CACHED
         await asyncio.sleep(5.0)
         *lost, last = await drained(events)
         assert last == resynced(component, ("PARAM_01",), vehicle)
         assert [event.kind for event in lost] == (["lost", "found"] if seconds > 5 else [])
-        assert bits(component.params) == bits(vehicle.params)
+        assert shell.bits(component.params) == shell.bits(vehicle.params)
 
 
 async def test_a_hash_that_is_lost_several_times_is_no_reason_for_a_download() -> None:
     """The vehicle has confirmed its table by one, and many packets are lost."""
-    tap = Tap(PX4Vehicle())
+    tap = shell.Tap(PX4Vehicle())
     async with fetched(Air.symmetric([tap], delay=0.02, loss=0.2), watch_interval=5.0) as (_, component):
         tap.received.clear()
         tap.is_deaf = True
-        await until(lambda: hashes(tap) == 5, pause=0.01)
+        await shell.until(lambda: hashes(tap) == 5, pause=0.01)
         tap.is_deaf = False
         await asyncio.sleep(15.0)
         assert component.sync_state is SyncState.SYNCED
@@ -278,12 +266,12 @@ async def test_a_hash_that_is_lost_several_times_is_no_reason_for_a_download() -
 
 
 async def test_a_watch_survives_a_link_that_drops_during_a_check() -> None:
-    tap = Tap(vehicle := small_px4())
-    link = FlakyLink(tap)
+    tap = shell.Tap(vehicle := shell.small_px4())
+    link = shell.FlakyLink(tap)
     async with fetched(link, watch_interval=5.0) as (_, component):
         tap.received.clear()
         tap.is_deaf = True
-        await until(lambda: hashes(tap), pause=0.01)
+        await shell.until(lambda: hashes(tap), pause=0.01)
         await link.drop(stays_offline=True)
         await asyncio.sleep(15.0)  # requests fail after 10 s
         tap.is_deaf = link.is_offline = False
@@ -306,19 +294,19 @@ def kept(path: Path) -> dict[tuple[str, int], object]:
 
 @pytest.mark.parametrize("answers", [True, False], ids=["says who it is late", "never says who it is"])
 async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, answers: bool) -> None:
-    berth, camera = Tap(small_px4(uid=1)), Tap(generic(component=100, uid=1))
+    berth, camera = shell.Tap(shell.small_px4(uid=1)), shell.Tap(shell.generic(component=100, uid=1))
     async with connected(Air([berth, camera]), cache=path) as (client, component):
         await client.fetch_all()
         await asyncio.sleep(1.0)
         await asyncio.gather(away(berth, 9.0), away(camera, 9.0))
-        stranger = small_px4(uid=2)
+        stranger = shell.small_px4(uid=2)
         stranger.set_param("PARAM_01", 1001)
         filters = [
             Filter(each, down=lambda message: not isinstance(message, messages.AutopilotVersion))
-            for each in (stranger, generic(component=100, uid=2, table={"PARAM_01": 1001}))
+            for each in (stranger, shell.generic(component=100, uid=2, table={"PARAM_01": 1001}))
         ]
         berth.endpoint, camera.endpoint = filters
-        await until(lambda: component.state != "lost")
+        await shell.until(lambda: component.state != "lost")
         with pytest.raises(errors.CacheError, match="which vehicle"):
             await component.set("PARAM_01", 1, durable=True)
         eye = client.components[1, 100]
@@ -349,14 +337,14 @@ async def learn(vehicle: PX4Vehicle, path: Path) -> None:
 
 
 async def test_cache_only_sends_nothing(path: Path) -> None:
-    vehicle = small_px4()
+    vehicle = shell.small_px4()
     await learn(vehicle, path)
-    tap = Tap(Air([vehicle, generic(component=100)]))
+    tap = shell.Tap(Air([vehicle, shell.generic(component=100)]))
     async with connected(tap, cache=path, policy="cache-only") as (client, component):
         result = await component.fetch_all()
         assert (result.source, result.hash, result.complete) == ("cache", None, True)
         assert "cache-only" in result.notes[0]
-        assert bits(result.params) == bits(vehicle.params)
+        assert shell.bits(result.params) == shell.bits(vehicle.params)
         assert component.sync_state is SyncState.UNSYNCED
         assert component.state == "cached"
         assert {param.trust for param in component.params.values()} == {Trust.CACHED}
@@ -370,13 +358,13 @@ async def test_cache_only_sends_nothing(path: Path) -> None:
         for call in (component.fetch_all, client.fetch_all):
             with pytest.raises(errors.CacheError, match="1/1"):
                 await call()
-        assert not residue(component)
+        assert not shell.residue(component)
 
 
 async def test_hash_only_requests_the_hash_alone(path: Path) -> None:
-    vehicle = small_px4()
+    vehicle = shell.small_px4()
     await learn(vehicle, path)
-    tap = Tap(vehicle)
+    tap = shell.Tap(vehicle)
     async with connected(tap, cache=path, policy="hash-only") as (_, component):
         result = await component.fetch_all()
         assert (result.source, result.hash) == ("cache", vehicle.announced_hash())
@@ -395,7 +383,7 @@ async def test_hash_only_requests_the_hash_alone(path: Path) -> None:
 
 @pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY])
 async def test_refresh_is_refused_with_a_policy_that_forbids_downloads(policy: Policy) -> None:
-    tap = Tap(small_px4())
+    tap = shell.Tap(shell.small_px4())
     async with connected(tap, policy=policy) as (client, component):
         for call in (component.fetch_all(refresh=True), client.fetch_all(refresh=True)):
             with pytest.raises(errors.UsageError, match=f"policy is {policy}"):
@@ -407,12 +395,12 @@ async def test_refresh_is_refused_with_a_policy_that_forbids_downloads(policy: P
 
 
 async def test_a_stream_of_events_outlives_a_cancelled_wait_and_has_a_bound_and_an_end() -> None:
-    async with connected(small_px4()) as (client, component):
+    async with connected(shell.small_px4()) as (client, component):
         events, others = client.events(), client.events()
         with anyio.move_on_after(0.01):
             await anext(events)
-        waiting = asyncio.ensure_future(outcome(anext(others)))
-        await settled()
+        waiting = asyncio.ensure_future(shell.outcome(anext(others)))
+        await shell.settled()
         for number in range(1010):
             events.push(Event(component, "lost", float(number)))
     assert [(await anext(events)).silence for _ in range(1000)] == [*range(10, 1010)], "the newest"
