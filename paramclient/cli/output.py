@@ -256,8 +256,7 @@ class Status:
     def _tick(self) -> None:
         self._next = self._loop.call_later(NOTICE_INTERVAL, self._tick)
         line = printable("; ".join(each._text for each in self._active))
-        shown = line[: shutil.get_terminal_size().columns - 1]
-        print(f"{ERASE}{shown}", end="", file=sys.stderr, flush=True)
+        print(f"{ERASE}{line[: shutil.get_terminal_size().columns - 1]}", end="", file=sys.stderr, flush=True)
         Status._is_drawn = True
 
     @property

@@ -81,7 +81,8 @@ async def show(
         output.print_table(["vehicle", *columns], rows)
         for name in shown if chosen and known is not None else ():
             _print_description(name, info_of(known, name))
-        say(described(shown) + (", those that differ from their default" if changed else ""))
+        how = ", those that differ from their default" if defaults else "; the defaults are not known"
+        say(described(shown) + (how if changed else ""))
         if changed:
             say_sources(address(shown), [defaults[name] for name in shown])
     return ExitCode.DONE
@@ -111,11 +112,10 @@ def search(
     if not lowered_words:
         raise UsageError("search takes one or more words")
     known = _Cached(options, vehicle, metadata)
-    ranks = {name: _rank(name, known.info(name), lowered_words) for name in known.names}
+    ranks = [_rank(name, known.infos(name), lowered_words) for name in known.names]
     found, rows = [], []
-    for _, name in sorted((rank, name) for name, rank in ranks.items() if rank is not None):
-        tables, info = known.having(name), known.info(name)
-        description = (info and info.short_description) or None
+    for _, name, description in sorted(filter(None, ranks)):
+        tables = [table for table, _ in known.having(name)]
         found.append({"name": name, "description": description, "vehicles": [each.key for each in tables]})
         values = {param_value(each.params[name]) for each in tables}
         value = f"{len(values)} values" if len(values) > 1 else next(iter(values), None)
@@ -146,21 +146,25 @@ def info(
     """
     known = _Cached(options, vehicle, metadata)
     spelled = next((each for each in known.names if each.upper() == name.upper()), check_name(name).upper())
-    info = known.info(spelled)  # also that of a group, FOO{n}_BAR, which is not among the names
-    if info is None:
+    infos = known.infos(spelled)  # also that of a group, FOO{n}_BAR, which is not among the names
+    if not infos:
         NameChoice([name]).choose(known.names, " of the cache")
     vehicles, rows = [], []
-    for table in known.having(spelled):
+    for table, info in known.having(spelled):
         param, heard = table_param_json(table.params[spelled], info), table.heard_at[spelled]
         autopilot, where = autopilot_name(table.autopilot), taken(table, "key", "system", "component")
         vehicles.append(where | {"autopilot": autopilot, "heard_at": time_text(heard), "param": param})
         cells = map(param.get, ("value", "text", "type", "default", "default_source"))
         rows.append((f"{table.system}/{table.component}", *cells, local_time(heard), table.key))
     if options.json:
-        output.print_json({"name": spelled, "metadata": info and info_json(info), "vehicles": vehicles})
+        output.print_json(
+            {"name": spelled, "metadata": next(map(info_json, infos), None), "vehicles": vehicles}
+        )
         return ExitCode.DONE
-    _print_description(spelled, info)
-    if info is None and known.undescribed:
+    for info in (*infos,) or (None,):
+        of = [f"{each.system}/{each.component}" for each, own in known.having(spelled) if own == info]
+        _print_description(f"{spelled} of {', '.join(of)}" if len(infos) > 1 else spelled, info)
+    if not infos and known.undescribed:
         say(f"no metadata of {known.undescribed} is known: {METADATA_HINT}")
     if rows:
         print_line("")
@@ -179,39 +183,42 @@ class _Cached:
     def __init__(self, options: CacheOptions, vehicle: str | None, given: Metadata | None) -> None:
         with ParamCache(options.cache) as cache:
             summaries = cache.components() if vehicle is None else tables_in(cache, vehicle)
-            summaries = sorted(summaries, key=lambda each: (each.system, each.component))
-            self._tables = tables = cache.load_all(summaries)
+            tables = sorted(cache.load_all(summaries), key=lambda each: (each.system, each.component))
             store = MetadataStore.beside(cache.path)
         found = [given or store.known(table.identity, table.component) for table in tables]
-        self._metadata = [*{id(each): each for each in (given, *found) if each is not None}.values()]
+        self._tables, self._metadata = [*zip(tables, found, strict=True)], (given, *found)
         self.names = {name for table in tables for name in table.params}
-        if given is not None:
-            self.names.update(name for name in given if "{" not in name)
-        self.undescribed = ", ".join(
-            f"{table.system}/{table.component} {autopilot_name(table.autopilot)}"
-            for table, each in zip(tables, found, strict=True)
-            if each is None and has_autopilot(table.autopilot)
-        )
+        self.names |= {name for name in given or () if "{" not in name}
+        without = [table for table, each in self._tables if each is None and has_autopilot(table.autopilot)]
+        names = (f"{each.system}/{each.component} {autopilot_name(each.autopilot)}" for each in without)
+        self.undescribed = ", ".join(names)
 
-    def info(self, name: str) -> ParamInfo | None:
-        """Return the description of a parameter, or None."""
-        return next((known for each in self._metadata if (known := each.find(name)) is not None), None)
+    def infos(self, name: str) -> list[ParamInfo]:
+        """Return the different descriptions of a parameter: those of the tables with it, if there are any."""
+        own = [info for _, info in self.having(name)] or [info_of(each, name) for each in self._metadata]
+        known = [info for info in own if info is not None]
+        return [info for at, info in enumerate(known) if info not in known[:at]]
 
-    def having(self, name: str) -> list[CachedComponent]:
-        """Return the tables with this parameter."""
-        return [table for table in self._tables if name in table.params]
+    def having(self, name: str) -> list[tuple[CachedComponent, ParamInfo | None]]:
+        """Return the tables with this parameter, each with the description of its own firmware."""
+        return [(table, info_of(each, name)) for table, each in self._tables if name in table.params]
 
 
-def _rank(name: str, info: ParamInfo | None, lowered_words: Sequence[str]) -> int | None:
-    """Return 0 if all words are in the name, 1 with the short description, 2 elsewhere; None if not."""
-    text, more = name, [""]
-    if info is not None:
-        named = [*info.values.values(), *info.bits.values(), info.group]
-        more += [info.short_description, " ".join([info.long_description, *named])]
-    for rank, each in enumerate(more):
-        text = f"{text} {each}".casefold()
-        if all(word in text for word in lowered_words):
-            return rank
+def _rank(
+    name: str, infos: Sequence[ParamInfo], lowered_words: Sequence[str]
+) -> tuple[int, str, str | None] | None:
+    """Return the rank of a name, the name, and the description that has it; None without all words.
+
+    The rank is 0 if all words are in the name, 1 with the short description, 2 elsewhere.
+    """
+    texts = []
+    for info in infos:
+        named = [info.long_description, *info.values.values(), *info.bits.values(), info.group]
+        texts.append((name, info.short_description, " ".join(named)))
+    for rank in range(3):
+        for text in (*texts, (name, "")):
+            if all(word in " ".join(text[: rank + 1]).casefold() for word in lowered_words):
+                return rank, name, text[1] or None
     return None
 
 

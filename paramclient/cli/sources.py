@@ -310,11 +310,8 @@ def _summary(found: JsonObject) -> str:
 
 def described(params: ParamSet) -> str:
     """Return a set in words: `903 parameters of 1/1 px4 from link sim:px4, 2026-11-20T18:00:00.000Z`."""
-    origin = [
-        "" if params.component is None else f"of {address(params)}",
-        params.autopilot,
-        f"from {params.source}" if params.source else "",
-    ]
+    of = "" if params.component is None else f"of {address(params)}"
+    origin = [of, params.autopilot, params.source and f"from {params.source}"]
     lacks = f" (incomplete: {params.lacks})" if params.lacks else ""
     at = "" if params.at is None else f", {local_time(params.at)}"
     return " ".join(filter(None, [counted(len(params), noun_of(params)), *origin])) + at + lacks

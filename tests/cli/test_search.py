@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
 from tests.commands import Command, Put
+from tests.metadata.test_added_files import described
 
 URL = "sim:px4"
 
@@ -80,6 +83,20 @@ def test_info_prints_the_description_and_the_values(command: Command) -> None:
     [vehicle] = document["vehicles"]
     assert (vehicle["system"], vehicle["param"]["value"]) == (1, 7.5)
     assert vehicle["heard_at"].endswith("Z")
+
+
+def test_each_vehicle_has_the_meaning_of_its_own_firmware(command: Command, put: Put, tmp_path: Path) -> None:
+    copter = ArduPilotVehicle(table={"MODE": 2})
+    rover = ArduPilotVehicle(table={"MODE": 2}, system=2, kind="rover")
+    for vehicle, name in ((copter, "ArduCopter"), (rover, "Rover")):
+        assert command("fetch", put(vehicle)).code == 0
+        file = described(tmp_path, name)
+        file.write_text(file.read_text().replace("Loiter", f"{name} 2"))
+        assert command("metadata", "add", file).code == 0
+    shown = command("info", "MODE")
+    assert [row[:3] for row in shown.rows[-2:]] == [["1/1", "2", "ArduCopter 2"], ["2/1", "2", "Rover 2"]]
+    assert "\nMODE of 2/1: Mode\n" in shown.out
+    assert command("search", "rover").rows[1][0] == "MODE"
 
 
 @pytest.mark.usefixtures("tables")
