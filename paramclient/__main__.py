@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Final, NoReturn
 
 COMMAND_LIBRARIES: Final = ("cyclopts", "rich")
@@ -24,7 +23,7 @@ def main() -> NoReturn:
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:  # closed, as by `2>&-`
-            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115 - until the end
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
     if missing := [name for name in COMMAND_LIBRARIES if find_spec(name) is None]:
         print(
             f"paramclient: the command needs {' and '.join(missing)}: pip install 'paramclient[cli]'",
@@ -40,8 +39,9 @@ def main() -> NoReturn:
         code = 128 + signal.SIGINT
     except BrokenPipeError:
         # flushing the buffers at interpreter exit would raise BrokenPipeError again
+        nowhere = os.open(os.devnull, os.O_WRONLY)
         for stream in (sys.stdout, sys.stderr):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+            os.dup2(nowhere, stream.fileno())
         code = 128 + SIGPIPE
     sys.exit(code)
 

@@ -276,15 +276,15 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
             hint = "--no-cache does without, and restore then needs a backup file"
             raise errors.CacheError(f"nothing was sent: {failure}; {hint}") from failure
     async with sessions(url, flags, writes=True) as found:
-        jobs, given = dict[CommandSession, _Job](), set[object]()
+        jobs, backups, systems = dict[CommandSession, _Job](), set[str | None](), set[object]()
 
         async def prepare(session: CommandSession) -> None:
             await wait_for_identity(session.component)
             backup = None if flags.backup is None else filled(flags.backup, session.component, session.label)
-            if backup is not None and (await anyio.Path(backup).exists() or backup in given):
+            if backup is not None and (await anyio.Path(backup).exists() or backup in backups):
                 problem = "exists already, or is another vehicle's; a name may have {uid} or {system}"
                 raise errors.FileError(problem, source=backup)
-            given.add(backup)
+            backups.add(backup)
             state, include = await load(session), flags.include
             if state.is_restore:
                 say(f"{session.prefix}the state: {described(state.params)}")
@@ -292,11 +292,11 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
             info = await known_of_session(session, metadata)
             options = ApplyOptions(include=include, info=info, partial=state.partial, backup=backup)
             system = plan_for(session.component, state.params, None, options).system_id
-            if system is not None and system in given:
+            if system is not None and system in systems:
                 hint = "a file for each has {system} in its name"
                 problem = f"nothing was sent: several vehicles would get the system id {system!r}; {hint}"
                 raise errors.FileError(problem, source=state.params.source)
-            given.add(system)
+            systems.add(system)
             options |= {"reboot": flags.reboot, "allow_armed": flags.allow_armed}
             jobs[session] = _Job(session, state, options)
 

@@ -314,7 +314,8 @@ class _Write:
         elif isinstance(answer, Param):
             if answer.type == self.before.type:
                 return answer
-            await anyio.sleep(channel.timing.slowest + channel.timing.timeout(0))  # for its other ones
+            # Acknowledgements of repeated sets, in this type too, would answer the read: they come first.
+            await anyio.sleep(channel.timing.slowest + channel.timing.timeout(0))
             self.session.acknowledging.discard(self.name)
         if not channel.is_silent(self._began):
             with suppress(NoReply):  # only a read shows a changed type, or an extended parameter's value

@@ -315,10 +315,10 @@ class _Run:
 
     def _must_reboot(self, done: Sequence[Stage]) -> bool:
         """Return whether the vehicle must reboot after the stages that are done."""
-        if done or not self._reboots_allowed:
+        if done:
             return self._reboots_allowed and done[-1].reboot_first and bool(self._reboot_for)
         is_reboot_due = bool(self._plan.awaiting_reboot) or self._pending_system_id() is not None
-        return bool(self._reboot_for) or (is_reboot_due and not self._reboots)
+        return self._reboots_allowed and (bool(self._reboot_for) or (is_reboot_due and not self._reboots))
 
     def _pending_system_id(self) -> int | None:
         """Return the system id that is set and takes effect after a reboot, or None."""
@@ -342,8 +342,7 @@ class _Run:
         if self._plan.of(ApplyStatus.LATER) or not self._inspection.is_reading_faster(len(names)):
             await self._inspect()
         else:
-            read = partial(reread, self.component, self._inspection, names, names)
-            await self._read(read, verifies=True)
+            await self._read(partial(reread, self.component, self._inspection, names, names), verifies=True)
 
     async def _read_revealed(self, done: Stage) -> None:
         """Read by name the parameters that a stage may have revealed. This verifies no write."""
@@ -442,10 +441,12 @@ class _Run:
             self.component = await component.client.successor(
                 component, system, timeout=SYSTEM_CHANGE_TIMEOUT
             )
-        except (NoReply, Refused) as error:
+        except Refused as error:
+            self._settle(row, ApplyStatus.REFUSED, str(error))
+            return
+        except NoReply as error:
             if not is_acknowledged:
-                is_refused = isinstance(error, Refused)
-                self._settle(row, ApplyStatus.REFUSED if is_refused else ApplyStatus.UNKNOWN, str(error))
+                self._settle(row, ApplyStatus.UNKNOWN, str(error))
                 return
         finally:
             self._written_at = anyio.current_time()

@@ -160,8 +160,7 @@ def is_offline(text: str) -> bool:
 
 def link_of(text: str) -> str:
     """Return the link that replays a telemetry log at full speed, for the name of one; else the text."""
-    is_telemetry = PurePath(text).suffix.lower() == ".tlog" and _exists(text)
-    return f"replay:{text}?speed=0" if is_telemetry else text
+    return f"replay:{text}?speed=0" if PurePath(text).suffix.lower() == ".tlog" and _exists(text) else text
 
 
 def _exists(text: str) -> bool:
