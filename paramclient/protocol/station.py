@@ -29,8 +29,10 @@ SEEK_MAX: Final = 20
 """Requests for the heartbeat of one system: it may be no vehicle, or serve no such request."""
 HEARTBEAT_INTERVAL: Final = 1.0
 """Seconds between two heartbeats of ours, by the standard."""
-PROBES: Final = 6
-"""Ways to find a component that was not heard; the last two are that of components under another address."""
+PROBES: Final = 13
+"""Turns of a search for a component that was not heard."""
+PROBES_OWN: Final = 7
+"""The first of them, in which the answers are to requests under its own address."""
 COMPONENTS_MAX: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each."""
 STREAM_PEERS_MAX: Final = 256
@@ -150,17 +152,19 @@ class Station:
 
         By turns its first parameter; the list, for firmware without reads; the index 1, where some begin; an
         extended parameter; and the first of the autopilot, under whose address some answer with their own.
+        Before and after that, a few turns go by: an answer must tell which address was asked.
         """
-        number = self._asked[system, component] = self._asked.get((system, component), -1) + 1
+        number = self._asked[system, component] = (self._asked.get((system, component), -1) + 1) % PROBES
         target = (system, component)
-        ways = (
-            PLAIN.request_read(target, 0),
-            PLAIN.request_list(target),
-            PLAIN.request_read(target, 1),
-            EXTENDED.request_read(target, 0),
-            *[PLAIN.request_read((system, messages.AUTOPILOT_COMPONENT), 0)] * 2,  # an answer may be late
-        )
-        self.transmit(ways[number % PROBES], None, next((node.version for node in self.nodes.values()), 2))
+        ways = {
+            0: PLAIN.request_read(target, 0),
+            1: PLAIN.request_list(target),
+            2: PLAIN.request_read(target, 1),
+            3: EXTENDED.request_read(target, 0),
+            **dict.fromkeys((7, 8, 9), PLAIN.request_read((system, messages.AUTOPILOT_COMPONENT), 0)),
+        }
+        if number in ways:
+            self.transmit(ways[number], None, next((node.version for node in self.nodes.values()), 2))
 
     def overhear(self, data: bytes, now: float) -> None:
         """Take a frame that another program sends to the vehicles over this link: it may be a PARAM_SET."""
@@ -255,8 +259,8 @@ class Station:
             if not isinstance(message, _SIGNS) or len(self.nodes) >= COMPONENTS_MAX:
                 return
             node = self._add(address, peer, now)
-            number = self._asked.get((system, component), 0) % PROBES
-            if number >= PROBES - 2 and isinstance(message, messages.ParamValue):  # the answer to a probe
+            is_other = self._asked.get((system, component), 0) >= PROBES_OWN
+            if is_other and isinstance(message, messages.ParamValue):  # the answer to a probe
                 node.channel.reads_from = (system, messages.AUTOPILOT_COMPONENT)
         if peer != node.peer:
             if not self._moves(node, peer, message, now):

@@ -391,13 +391,14 @@ async def test_the_encoding_is_looked_for_once_and_within_a_round_trip(maker: ty
 # addresses
 
 
-@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize(("first", "delay"), [(0, 0.0), (1, 0.0), (0, 0.8)])
 @pytest.mark.parametrize("serves", [EVERYTHING, ("list",), ("names", "indices"), ("indices",)], ids="+".join)
 async def test_a_component_without_heartbeat_is_found_by_both_ids(
-    serves: tuple[str, ...], first: int
+    serves: tuple[str, ...], first: int, delay: float
 ) -> None:
     bridge = Partial(serves=serves, first=first, heartbeat=None, component=240)
-    async with ParamClient(Air.symmetric([GenericVehicle({"A": 1}), bridge]), cache=False) as client:
+    air = Air.symmetric([GenericVehicle({"A": 1}), bridge], delay=delay)
+    async with ParamClient(air, cache=False) as client:
         component = await client.component(1, 240)
         assert (await component.get("MODE")).value == 5
         assert client.autopilots == [client.components[1, 1]]
@@ -418,12 +419,11 @@ async def test_a_component_that_starts_late_is_asked_under_its_own_id() -> None:
 
 
 async def test_values_under_another_id_are_named_and_can_be_read() -> None:
-    vehicle = Partial(component=50, asked_as=1, heartbeat=None)
-    beacon = Puppet(lambda message: ())
-    async with ParamClient(Air.symmetric([beacon, vehicle]), cache=False) as client:
+    both = [Puppet(lambda message: ()), Partial(component=50, asked_as=1, heartbeat=None)]
+    async with ParamClient(Air.symmetric(both), cache=False) as client:
         with pytest.raises(errors.NoReply, match="values came from 1/50"):
             await (await client.component(1, 1)).fetch_all()
-    async with ParamClient(Air.symmetric([beacon, vehicle]), cache=False) as client:
+    async with ParamClient(Air.symmetric(both, delay=0.8), cache=False) as client:
         result = await (await client.component(1, 50)).fetch_all()
         assert (result.complete, set(result.params)) == (True, set(TABLE))
 
