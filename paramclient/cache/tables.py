@@ -19,6 +19,7 @@ from typing import Any, Final
 from paramclient.cache.database import IDENTITY, Transaction
 from paramclient.cache.history import SAME_CHANGE_MAX, Line, add_lines, lines_since, load_lines, merged_lines
 from paramclient.cache.records import (
+    BY_VEHICLE,
     CachedComponent,
     CachedSummary,
     CachedVehicle,
@@ -229,8 +230,7 @@ def save_table(tx: Transaction, update: TableUpdate, now: float, known: KnownLin
     names = {item.name for item in update.params}
     if update.table and not update.table.volatile_known and any(item.volatile for item in update.params):
         tx.do("UPDATE parameter SET volatile = 0 WHERE owner = ?", (owner,))  # it was learnt anew which are
-    is_all = update.replace or len(names) > NAMES_SELECTED_MAX
-    rows = load_rows(tx, owner, None if is_all else names)
+    rows = load_rows(tx, owner, None if update.replace or len(names) > NAMES_SELECTED_MAX else names)
     gone = [name for name, row in rows.items() if row.stored and name not in names] if update.replace else []
     observed = [*update.params, *(StoredParam.gone(name, update.at) for name in gone)]
     is_known = before is not None and before.known_since is not None
@@ -334,6 +334,8 @@ def _unrecorded(
         for number, line in recent.get(item.name, ()):
             is_near = number > last and line.at > item.heard_at - SAME_CHANGE_MAX
             if is_near and is_same_value(line.new, item.stored):
+                if line.by == BY_VEHICLE:  # the other program may not know who has set it
+                    tx.do("UPDATE history SET author = ? WHERE id = ?", (item.by, number))
                 known[owner, item.name] = (number, 0.0)
                 kept[item.name] = []
                 is_kept = is_same_value(row and row.stored, item.stored)

@@ -280,9 +280,8 @@ class ParamClient:
             NoReply: no message of the component arrived in time.
             LinkError: the link failed, or the client was closed.
         """
-        nodes = self.core.station.nodes
         return await self._wait_for(
-            lambda: selection.find(nodes.values(), system, component, peer),
+            lambda: selection.find(self.core.station.nodes.values(), system, component, peer),
             selection.address_in_words(system, component, peer),
             timeout,
             asked=(system, component),

@@ -30,7 +30,8 @@ def test_each_change_has_one_line(cache: ParamCache, open_cache: Open) -> None:
     cache.save(whole_table(2))
     change(cache, 5, 1, by="us for Ann")
     change(open_cache(), 5, 2)  # another program has received the same
-    change(cache, 6, 3, by="station 254/190")
+    change(open_cache(), 6, 3)  # another one has not heard who has set it
+    change(cache, 6, 3.1, by="station 254/190")
     cache.save(update(removed={"PARAM_1": NOW + 4}, at=NOW + 4))
     assert lines(cache) == [
         (1, "PARAM_0", 0, 5, "us for Ann"),

@@ -473,8 +473,7 @@ async def test_part_of_a_vehicle_is_never_the_vehicle(heartbeat: messages.Heartb
 
 async def test_a_component_with_the_id_0_is_a_component() -> None:
     async with ParamClient(Partial(component=0, asked_as=0), cache=False) as client:
-        component = await client.component(1, 0)
-        assert (await component.fetch_all()).complete
+        assert (await (await client.component(1, 0)).fetch_all()).complete
         with pytest.raises((errors.NoReply, errors.AmbiguousVehicle)):
             await client.component(1, 7, timeout=3.0)
 
