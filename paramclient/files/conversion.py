@@ -359,6 +359,5 @@ def kind_of(data: bytes) -> str | None:
         return "parameter storage of PX4 (BSON); save the parameters with a ground station"
     if data[8:9] in (b"\xfd", b"\xfe") and b"\0" in data[:BEGIN_SIZE]:
         return "a telemetry log (.tlog), which goes as replay:FILE"
-    encoding = "utf-16" if data.startswith(UTF16_MARKS) else "utf-8-sig"
-    text = data[:BEGIN_SIZE].decode(encoding, "replace")
+    text = data[:BEGIN_SIZE].decode("utf-16" if data.startswith(UTF16_MARKS) else "utf-8-sig", "replace")
     return next((kind for pattern, kind in _TEXTS if re.search(f"(?im){pattern}", text)), None)

@@ -253,8 +253,9 @@ def _time(content: object) -> float:
         raise UsageError(f"a time is written as 2026-01-31T12:00:00Z{_found(content)}") from None
     if moment.tzinfo is None:
         raise UsageError("the time needs its zone, as in 2026-01-31T12:00:00Z")
-    time_text(at := moment.timestamp())  # else it could not be written again
-    return at
+    if not 1 < moment.year < 9999:
+        raise UsageError(f"not every time zone has this time{_found(content)}")
+    return moment.timestamp()
 
 
 def _type(content: object) -> ParamType | int:

@@ -580,7 +580,8 @@ def test_an_invalid_field_is_rejected(fields: str, problem: str) -> None:
         ('{"paramclient": 1, "sets": [{"params": {"A": {}, "A": {}}}]}', "'A' occurs twice"),
         ('{"a":' * 100_000, "nested too deep"),
         ('{"A": %s}' % ("9" * 5000), "not a parameter file of paramclient"),
-        ('{"paramclient": 1, "sets": [{"at": "9999-12-31T23:59:59.9999999Z", "params": {}}]}', "not a valid"),
+        ('{"paramclient": 1, "sets": [{"at": "9999-12-31T23:59:59.9999999Z", "params": {}}]}', "not every"),
+        ('{"paramclient": 1, "sets": [{"at": "0001-01-01T00:00:00Z", "params": {}}]}', "not every time zone"),
         (
             '{"paramclient": 1, "sets": [{"params": {"A": {"value": 1}}}, {"component": 1, "params": {}}]}',
             "quad.x: two sets have the same component, ?/1",
