@@ -15,7 +15,7 @@ from paramclient.errors import FileError, PackError, UsageError
 from paramclient.files import json_format, lists
 from paramclient.files.disk import LARGEST_FILE, read_bytes, replace_file
 from paramclient.files.formats import AUTOPILOT, ENDINGS, FileFormat, ParamFile, address, format_of_name
-from paramclient.files.reading import LACKS, UTF16_MARKS, Reading
+from paramclient.files.reading import UTF16_MARKS, Reading, lacks_begin
 from paramclient.model.identity import version_text
 from paramclient.model.names import counted, first_of
 from paramclient.model.notation import time_text
@@ -181,10 +181,9 @@ def _format_of(reading: Reading) -> FileFormat:
     if lists.is_qgc_row(reading.first):
         return FileFormat.QGC
     named = ENDINGS.get(PurePath(reading.source).suffix.lower(), FileFormat.PCK)
-    if named in (FileFormat.PARM, FileFormat.MISSION_PLANNER):
-        return named
-    if named is not FileFormat.PCK and not lists.is_pair(reading.first):
-        return named  # no other format is possible, and reading gives the error for this one
+    is_list = named in (FileFormat.PARM, FileFormat.MISSION_PLANNER)
+    if is_list or not (named is FileFormat.PCK or lists.is_pair(reading.first)):
+        return named  # else no other format is possible, and reading gives the error for this one
     return FileFormat.MISSION_PLANNER if "," in reading.first else FileFormat.PARM
 
 
@@ -266,11 +265,12 @@ def _as_file(content: Mapping[str, Any] | Iterable[ParamSet], file_format: FileF
     sets = (set_of(content),) if isinstance(content, Mapping) else tuple(content)
     if wrong := [each for each in sets if not isinstance(each, ParamSet)]:
         raise TypeError(f"{wrong[0]!r} is not a ParamSet, nor are these parameters by name")
-    untold = () if file_format is FileFormat.JSON else sets  # the document has fields for the header's facts
-    return ParamFile(sets, file_format, header=tuple(line for each in untold for line in _header_lines(each)))
+    header = (line for each in sets for line in _header_lines(each, lacks_begin(each, sets)))
+    # a document has fields for these facts
+    return ParamFile(sets, file_format, header=() if file_format is FileFormat.JSON else tuple(header))
 
 
-def _header_lines(params: ParamSet) -> Iterator[str]:
+def _header_lines(params: ParamSet, lacks: str) -> Iterator[str]:
     """Generate a description of a set, for the header of a file."""
     identity = params.identity
     kind = f", {params.autopilot}" if params.autopilot else ""
@@ -281,7 +281,7 @@ def _header_lines(params: ParamSet) -> Iterator[str]:
         yield f"of the vehicle {identity.key}{firmware}"
     if params.at is not None:
         yield f"as of {time_text(params.at, 'seconds')}"
-    yield from (f"{begin}{text}" for begin, text in (("from ", params.source), (LACKS, params.lacks)) if text)
+    yield from (f"{begin}{text}" for begin, text in (("from ", params.source), (lacks, params.lacks)) if text)
 
 
 def _check(sets: Sequence[ParamSet], file_format: FileFormat, source: str = "") -> None:

@@ -284,8 +284,7 @@ def _number(content: object) -> Value:
 
 def _custom(content: object) -> Value:
     """Return a CUSTOM value: text, or bytes after `hex:`."""
-    value = parse_ext_value("value", _text(content), _CUSTOM)
-    return from_bits(bits_of(value, _CUSTOM), _CUSTOM)
+    return from_bits(bits_of(parse_ext_value("value", _text(content), _CUSTOM), _CUSTOM), _CUSTOM)
 
 
 def _with_bits(value: Value, kind: ParamType | int | None, text: str) -> Value:

@@ -242,8 +242,7 @@ def _whole(text: str, low: int, high: int, expected: str) -> int:
 def _qgc_value(text: str, kind: ParamType) -> Value:
     number = math.nan if _qgc_nan(text) else parse_number(text)
     if number is None:
-        comma = " with a decimal point" if "," in text else ""
-        raise UsageError(f"a number{comma} in the fourth column")
+        raise UsageError(f"a number{' with a decimal point' * (',' in text)} in the fourth column")
     try:
         return as_type(number, kind)
     except UsageError as error:

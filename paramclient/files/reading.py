@@ -6,13 +6,13 @@ import codecs
 import math
 import re
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Final, NamedTuple
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.formats import FileFormat, ParamFile
+from paramclient.files.formats import FileFormat, ParamFile, address
 from paramclient.model.names import counted, first_of
 from paramclient.model.notation import value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -24,8 +24,6 @@ EXCERPT_LENGTH_MAX: Final = 80
 """Characters of a bad line that an error shows, so that the error stays readable."""
 NUMBER_LENGTH_MAX: Final = 400
 """Characters of a number: the longest decimal form of a double without padding has fewer."""
-LACKS: Final = "incomplete: "
-"""Begins the line in the header of a list that has `ParamSet.lacks`."""
 UTF16_MARKS: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 """The byte order marks with which a text in UTF-16 begins."""
 
@@ -146,12 +144,11 @@ class Reading:
         Raises:
             FileError: the file has faults, all of which the error has, or no parameters.
         """
-        if sets is None:
-            sets = tuple(
-                ParamSet({name: p for name, (p, _) in each.items()}, component, system, source=self.source)
-                for (system, component), each in self._sets.items()
-            )
-        is_refused = self._is_damaged or not self.partial or not any(sets)
+        found = sets or tuple(
+            ParamSet({name: p for name, (p, _) in each.items()}, component, system, source=self.source)
+            for (system, component), each in self._sets.items()
+        )
+        is_refused = self._is_damaged or not self.partial or not any(found)
         own = "" if is_refused else self.source  # which stands before each note
         faults = [FileError(what, source="" if of == own else of, line=at) for of, at, what in self._faults]
         told = [*map(str, faults)]
@@ -160,12 +157,17 @@ class Reading:
         if told and is_refused:
             first = faults[0]
             raise FileError(first.reason, source=first.source, line=first.line, more=tuple(told[1:]))
-        if not any(sets):
+        if not any(found):
             raise FileError("the file contains no parameters", source=self.source)
         self.notes += [f"{each}; left out." for each in told]
-        known = [line.removeprefix(LACKS) for line in header if line.startswith(LACKS)]
-        known += [f"without {counted(self.fault_count, 'parameter')} that cannot be read"] if told else []
-        sets = tuple(replace(each, lacks="; ".join(filter(None, (each.lacks, *known)))) for each in sets)
+        unread = f"without {counted(self.fault_count, 'parameter')} that cannot be read" if told else ""
+
+        def lacks_of(each: ParamSet) -> str:
+            begin = lacks_begin(each, found)
+            known = [line.removeprefix(begin) for line in header if line.startswith(begin)]
+            return "; ".join(filter(None, (each.lacks, *known, unread)))
+
+        sets = tuple(replace(each, lacks=lacks_of(each)) for each in found)
         if (more := self._repeated - FAULTS_MAX) > 0:
             self.notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")
         if self.foreign:
@@ -174,14 +176,18 @@ class Reading:
         return ParamFile(sets, file_format, self.source, header, footer, tuple(self.notes), self.fault_count)
 
 
+def lacks_begin(params: ParamSet, sets: Sequence[ParamSet]) -> str:
+    """Return the begin of the line with `ParamSet.lacks` of one of a list's sets, in its header."""
+    return "incomplete: " if len(sets) == 1 else f"incomplete: {address(params)}: "
+
+
 def _repetition(before: WrittenParam, at: str, param: WrittenParam, place: str) -> str:
     """Return the note on a name that occurs twice. 1 and 1.0 are the same value, −0.0 and 0.0 are not."""
     ignored, used = (
         format_value(each.settable, ParamType.REAL64) + ("" if each.type is None else f" ({each.type.name})")
         for each in (before, param)
     )
-    same = (before.value, before.type, ignored[0]) == (param.value, param.type, used[0])
-    if same or ignored == used:
+    if (before.value, before.type, ignored[0]) == (param.value, param.type, used[0]) or ignored == used:
         return f"{param.name} occurs twice with the same value, in {at} and {place}."
     return f"{param.name} occurs twice: {used} in {place} is used, not {ignored} in {at}."
 

@@ -41,8 +41,7 @@ def at_terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Non
             hand, terminal = pty.openpty()
             os.write(hand, f"{text}\n".encode())
             opened.enter_context(os.fdopen(hand, "wb"))
-            stdin = opened.enter_context(os.fdopen(terminal, encoding="utf-8"))
-            monkeypatch.setattr(sys, "stdin", stdin)
+            monkeypatch.setattr(sys, "stdin", opened.enter_context(os.fdopen(terminal, encoding="utf-8")))
             monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
 
         yield answer

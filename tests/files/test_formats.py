@@ -213,6 +213,8 @@ def test_a_qgroundcontrol_file_has_a_set_per_component() -> None:
         file.choose(7)
     with pytest.raises(FileError, match=r"no set matches \(system 9, the autopilot\)"):
         file.choose(system=9)
+    partial = dumps([replace(file.sets[0], lacks="3 of 4"), *file.sets[1:]], file_format="qgc")
+    assert [each.lacks for each in loads(partial).sets] == ["3 of 4", "", ""]
 
 
 @pytest.mark.parametrize("name", ["ardupilot_param.pck", "ardupilot_param_withdefaults.pck"])
