@@ -222,9 +222,8 @@ def test_the_first_example_prints_what_its_comments_say(tmp_path: Path) -> None:
     "code", [pytest.param(code, id=name) for name, code in programs() if SITL not in code]
 )
 def test_a_program_runs_and_prints_what_its_page_shows(code: str, tmp_path: Path) -> None:
-    printed = run_program(code, tmp_path)
     if code in outputs():
-        assert DURATION.sub("0.0 s", printed) == DURATION.sub("0.0 s", outputs()[code])
+        assert DURATION.sub("0.0 s", run_program(code, tmp_path)) == DURATION.sub("0.0 s", outputs()[code])
 
 
 @pytest.mark.slow
@@ -269,9 +268,8 @@ def test_the_commands_for_users_of_other_programs_run(tmp_path: Path) -> None:
 @contextmanager
 def simulating(vehicle: str, port: int, cwd: Path) -> Iterator[None]:
     """Run a simulated vehicle in a process of its own, which sends to a port of this computer."""
-    words = ["-m", "paramclient", "sim", vehicle, "--link", f"udpout:127.0.0.1:{port}"]
     with subprocess.Popen(
-        [sys.executable, *words],
+        [sys.executable, "-m", "paramclient", "sim", vehicle, "--link", f"udpout:127.0.0.1:{port}"],
         cwd=cwd,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stderr=subprocess.DEVNULL,

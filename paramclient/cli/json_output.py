@@ -183,7 +183,7 @@ def fetch_json(
         **vehicle_json(component),
         **taken(result, "count", "received", "source"),
         "hash": hash_text(result.hash),
-        **taken(result, "missing", "cached", "changed", "lost", "repeated"),
+        **taken(result, "missing", "cached", "changed", "lost", "repeated", "notes"),
         "round_trip_s": rounded(result.round_trip),
         "elapsed_s": round(result.elapsed, 4),
         **taken(component.core.link_task, "bytes_received", "bytes_sent"),

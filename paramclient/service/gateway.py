@@ -159,21 +159,22 @@ class Gateway:
     def _answer(self, station: GroundStation, source: Source, message: Request, seen: SeenFrame) -> bool:
         """Answer a request about parameters; return False for one that passes to the vehicles.
 
-        One to whichever vehicle passes if there are several. Before one is heard, such a request does not
-        pass: the vehicle would send its list, or open its file, beside the gateway's own fetch.
+        One to whichever vehicle passes if there are several, or if it is for the autopilot, which is not
+        served. Before one is heard, such a request does not pass: the vehicle would send its list, or open
+        its file, beside the gateway's own fetch.
         """
         address = (message.target_system, message.target_component)
         extended = isinstance(message, EXTENDED_REQUESTS)
         found = {table: link for link in self.links for table in link.tables(*address, extended=extended)}
         served = [table for table, link in found.items() if self._serves(station, table, link)]
-        systems = {table.source[0] for table in found}
-        if not served or (len(systems) > 1 and not isinstance(message, ListRequest)):
+        autopilots = [table for table in found if table.source[1] == messages.AUTOPILOT_COMPONENT]
+        is_for_one = len({table.source[0] for table in found}) == 1 and {*autopilots} <= {*served}
+        if not served or not (is_for_one or isinstance(message, ListRequest)):
             if isinstance(message, ListRequest):
-                station.list_asked_at = anyio.current_time()
+                station.list_asked = (anyio.current_time(), address, extended, set())
             return not (found or message.target_system)
         present = [table for table in served if not table.is_lost]
-        autopilots = [table for table in present if table.source[1] == messages.AUTOPILOT_COMPONENT]
-        one = (autopilots or present)[:1]  # that answers a request which all components receive
+        one = [table for table in autopilots or present if table in present][:1]  # for all that receive it
         asker = Asker(station, *source)
         match message:
             case messages.ParamRequestList() | messages.ParamExtRequestList():
@@ -199,7 +200,7 @@ class Gateway:
         """Return whether requests of a station to a component are answered from its table."""
         if not table.is_kept or (table.source in link.signing and not station.endpoint.may_sign):
             return False
-        is_double = any(each is not link and each.is_vehicle(table.source) for each in self.links)
+        is_double = sum(each.is_vehicle(table.source) for each in self.links) > 1
         if is_double and table.source not in self._warned:
             self._warned.add(table.source)
             logger.warning("%d/%d is on two links: stations are not answered from its table", *table.source)

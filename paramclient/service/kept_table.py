@@ -269,8 +269,11 @@ class KeptTable(Stream[Change]):
 
     def take_over(self, station: GroundStation) -> None:
         """Answer a list that was asked before, now that the vehicle is heard and its values are withheld."""
-        if anyio.current_time() - station.list_asked_at < TAKE_OVER_TIME:
-            station.list_asked_at = -math.inf
+        at, (system, component), extended, taken = station.list_asked
+        is_new = anyio.current_time() - at < TAKE_OVER_TIME and self not in taken
+        is_meant = system in (0, self.source[0]) and component in (0, self.source[1])
+        if is_new and is_meant and extended == self.session.dialect.has_ack:
+            taken.add(self)
             self.send_list(station)
 
     def _stream(self, station: GroundStation, values: Iterable[ReportedValue], sent: set[int]) -> None:

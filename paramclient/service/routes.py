@@ -137,7 +137,7 @@ class UploadedFile(Body):
     text: Annotated[str, Field(max_length=FILE_BYTES_MAX)] | None = None
     base64: Annotated[bytes, BeforeValidator(_decode), Field(max_length=FILE_BYTES_MAX)] | None = None
     format: FileFormat | None = None
-    component: Annotated[int, Field(ge=1, le=255)] | None = None
+    component: Annotated[int, Field(ge=0, le=255)] | None = None
 
     def read(self, *, partial: bool = False) -> ParamFile:
         """Parse the file; see `files.loads`. Blocks for up to seconds.
@@ -326,9 +326,8 @@ async def param(
 async def set_param(author: Author, target: TargetArgument, name: str, body: WriteRequest) -> JsonObject:
     """Write one parameter, and verify the value that the vehicle reports."""
     values = await target.values({name: body.value}, force=body.force)
-    options = body.model_dump(exclude={"value"})
-    result = await target.component.set(name, values[name], **options, author=author)
-    return target.outcome(SetOutcome(name, values[name], SetStatus(result.status), result))
+    done = await target.component.set(name, values[name], **body.model_dump(exclude={"value"}), author=author)
+    return target.outcome(SetOutcome(name, values[name], SetStatus(done.status), done))
 
 
 @writing.patch(f"{VEHICLE}/params")
@@ -339,8 +338,7 @@ async def set_params(author: Author, target: TargetArgument, body: WriteManyRequ
     the others. `error` says why not all could be tried, if so.
     """
     values = await target.values(body.values, force=body.force)
-    options = body.model_dump(exclude={"values"})
-    result = await target.component.set_many(values, **options, author=author)
+    result = await target.component.set_many(values, **body.model_dump(exclude={"values"}), author=author)
     results = [target.outcome(each) for each in result.outcomes]
     error = {} if result.error is None else {"error": str(result.error)}
     ids = {"system": target.component.system, "component": target.component.component}
@@ -475,8 +473,7 @@ def _context(author: str, target: Target) -> dict[str, Any]:
 @reading.get(f"{VEHICLE}/snapshots")
 async def snapshots(target: TargetArgument) -> JsonObject:
     """Return the snapshots, the newest last."""
-    found = await target.cached(ParamCache.snapshots)
-    return {"snapshots": [json_output.snapshot_json(each) for each in found]}
+    return {"snapshots": [*map(json_output.snapshot_json, await target.cached(ParamCache.snapshots))]}
 
 
 @writing.post(f"{VEHICLE}/snapshots", status_code=201)
@@ -529,7 +526,7 @@ def _metrics(hub: Hub) -> Iterator[tuple[str, Sequence[tuple[Mapping[str, object
 
     yield "component_synced", [(each.address, each.component.sync_state == "synced") for each in hub.targets]
 
-    endpoints = [({"endpoint": each.name}, each.stations.values()) for each in hub.gateway.endpoints]
+    endpoints = [({"endpoint": each.address}, each.stations.values()) for each in hub.gateway.endpoints]
     yield "stations", [(at, len(stations)) for at, stations in endpoints]
     for name in ("relayed", "answered", "saved", "dropped"):
         sums = [(at, sum(getattr(each, name) for each in stations)) for at, stations in endpoints]

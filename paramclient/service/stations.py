@@ -112,7 +112,8 @@ class GroundStation:
         sources: the system and component ids under which it sends.
         version: of MAVLink, of the answers: 1 only for a station that has sent version 1 and never 2.
         requests: of parameters, by kind.
-        list_asked_at: when it last asked for a list of which no table was known.
+        list_asked: when it last asked for a list of which no table was known; its address, and whether it is
+            of extended parameters; and the tables that have answered since.
         is_loop: whether it returns what others have sent.
         waiting: requests that wait.
         files: that it has open over MAVFTP, by session.
@@ -129,7 +130,7 @@ class GroundStation:
         self.sources: set[Source] = set()
         self.version = 2
         self.requests: Counter[str] = Counter()
-        self.list_asked_at = -math.inf
+        self.list_asked: tuple[float, Source, bool, set[Any]] = (-math.inf, (0, 0), False, set())
         self.is_loop = False
         self.waiting = 0
         self.files: dict[tuple[Hashable, ...], Any] = {}

@@ -312,8 +312,7 @@ def test_restore_needs_a_stored_state(command: Command, put: Put, when: list[str
 
 def fleet(**options: Any) -> tuple[Air, list[ArduPilotVehicle]]:
     vehicles = [copter(system=system) for system in (1, 2, 3)]
-    camera = GenericVehicle({"CAM_MODE": 1}, system=2, component=100)
-    return Air([*vehicles, camera], **options), vehicles
+    return Air([*vehicles, GenericVehicle({"CAM_MODE": 1}, system=2, component=100)], **options), vehicles
 
 
 def test_all_vehicles_are_set_and_restored_each_with_its_own_values(

@@ -39,8 +39,7 @@ def test_many_pairs_are_in_flight_at_a_time(command: Command, put: Put, kind: An
 
 
 def test_every_value_has_an_outcome_of_its_own(command: Command, put: Put, at_terminal: Any) -> None:
-    small = (ParamType.INT8, 0)
-    table: dict[str, Any] = {"A": 1.0, "COUNT": 3, "FIXED": 2.0, "SMALL": small}
+    table: dict[str, Any] = {"A": 1.0, "COUNT": 3, "FIXED": 2.0, "SMALL": (ParamType.INT8, 0)}
     vehicle = ArduPilotVehicle(table=table, read_only=["FIXED"], live=(), ftp=False, param_error=True)
     words = ["NO_SUCH=1", "A", 6, "COUNT", 7.6, "SMALL=300", "FIXED", 9]
     refused = command("set", put(vehicle), *words)

@@ -234,8 +234,7 @@ async def test_a_stream_that_drops_is_not_continued(tmp_path: Path) -> None:
         await anyio.sleep(2.0)
         assert link.openings == 2
         assert client.bytes_received
-    lines = [each.text for each in recorded(path) if isinstance(each, messages.StatusText)]
-    assert lines == ["line 2"]
+    assert [each.text for each in recorded(path) if isinstance(each, messages.StatusText)] == ["line 2"]
 
 
 def test_the_command_logs_its_steps(capsys: pytest.CaptureFixture[str]) -> None:

@@ -210,8 +210,7 @@ async def test_two_values_changed_by_others_are_found_and_named() -> None:
         assert result.params["ATC_RAT_RLL_P"].default == 0.135
         assert sum(map(len, conversation.sent[sent:])) < 1_000
         assert anyio.current_time() - began < 0.2
-        changes = {each.name: each.by for each in conversation.changes}
-        assert changes["FORMAT_VERSION"] == "vehicle"
+        assert {each.name: each.by for each in conversation.changes}["FORMAT_VERSION"] == "vehicle"
 
 
 async def test_changed_values_are_found_in_less_time_than_the_file_takes() -> None:

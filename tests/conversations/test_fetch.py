@@ -42,8 +42,7 @@ def check_right(vehicle: Vehicle, result: FetchResult) -> None:
     assert not result.missing
     listed = {param.name: param for param in vehicle.listed}
     assert set(listed) <= set(result.params)
-    wrong = [name for name, param in listed.items() if not result.params[name].same_value(param)]
-    assert not wrong
+    assert not [name for name, param in listed.items() if not result.params[name].same_value(param)]
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.05, 0.2, 0.4])

@@ -125,8 +125,7 @@ async def test_the_session_of_another_station_is_waited_for() -> None:
     vehicle = serving(500)
     vehicle.files["other.bin"] = CONTENT[:500]
     async with talking(vehicle) as (_, session):
-        other = Packet(77, 5, Opcode.OPEN_FILE_RO, b"other.bin")
-        session.channel.send(FileTransfer(0, 1, 1, other.pack()))
+        session.channel.send(FileTransfer(0, 1, 1, Packet(77, 5, Opcode.OPEN_FILE_RO, b"other.bin").pack()))
         await anyio.sleep(0.1)
         assert vehicle.open_files == ["other.bin"]
         began = anyio.current_time()
@@ -202,8 +201,7 @@ async def test_a_file_that_is_not_valid_leads_to_the_list_and_drops_nothing(cont
     async with talking(vehicle) as (conversation, session):
         first = await fetch_all(session)
         if content is None:
-            rows = [PackedParam(each.name, each.type, each.bits) for each in vehicle.listed]
-            content = encode(rows)[:-7]
+            content = encode([PackedParam(each.name, each.type, each.bits) for each in vehicle.listed])[:-7]
         vehicle.files.update(dict.fromkeys(("@PARAM/param.pck", "@PARAM/param.pck?withdefaults=1"), content))
         second = await fetch_all(session, refresh=True)
         assert (first.source, second.source) == ("ftp", "stream")
@@ -240,8 +238,8 @@ async def test_integers_of_a_file_are_exact_and_keep_so_beside_rounded_messages(
 
 
 async def test_a_refused_file_is_not_requested_again_on_the_link() -> None:
-    vehicle = PX4Vehicle(param_error=True)  # claims to have it, and answers: file not found
-    async with talking(vehicle) as (conversation, session):
+    """The vehicle claims to have it, and answers: file not found."""
+    async with talking(PX4Vehicle(param_error=True)) as (conversation, session):
         await session.identification.settled()
         for _ in range(2):
             result = await fetch_all(session, refresh=True)

@@ -332,8 +332,7 @@ async def test_values_of_one_parameter_are_set_in_the_order_of_the_call() -> Non
     async with talking(Air.symmetric([vehicle], delay=0.01)) as (conversation, session):
         values = [1000.0 + number for number in range(12)]
         await many(session, [(names[number % 2], value) for number, value in enumerate(values)])
-        sent = [struct.unpack("<f", each.raw)[0] for each in conversation.sent_of(ParamSet)]
-        assert sent == values
+        assert [struct.unpack("<f", each.raw)[0] for each in conversation.sent_of(ParamSet)] == values
         assert vehicle.param("RTL_ALT").value == values[-1]
 
 
@@ -463,8 +462,7 @@ async def test_a_switch_and_the_parameters_behind_it_are_set_in_one_call() -> No
         await many(session, [("EK2_ENABLE", 0)])
         await fetch_all(session)
         assert (session.table.count, hidden in session.table.params) == (count, False)
-        kinds = [each.kind for each in conversation.changes if each.name == hidden]
-        assert kinds[-1] == "removed"
+        assert [each.kind for each in conversation.changes if each.name == hidden][-1] == "removed"
 
 
 @pytest.mark.parametrize(("rate", "after"), [(2_000, 1.0), (4_000, 0.3), (8_000, 0.3)])

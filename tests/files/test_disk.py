@@ -180,8 +180,7 @@ def test_an_impossible_include_is_reported_with_its_line(line: str, problem: str
         outside_parm="SECRET 1\n",
     )
     (first.parent / "link.parm").symlink_to(tmp_path / "outside.parm")
-    error = refused(lambda: read_file(first))
-    reported = str(error)
+    reported = str(refused(lambda: read_file(first)))
     assert problem in reported
     assert f"{first}:2: " in reported
     assert "SECRET" not in reported

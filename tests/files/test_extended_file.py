@@ -55,8 +55,7 @@ def read(path: Path) -> ParamSet:
 def test_a_written_file_reads_back_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "camera.json"
     params = every_kind()
-    content = ParamSet(params, 100, 1, at=1_700_000_000.0, source="link sim:camera", is_extended=True)
-    write_file(path, content)
+    write_file(path, ParamSet(params, 100, 1, at=1_700_000_000.0, source="link sim:camera", is_extended=True))
     assert path.read_bytes() == (DATA / "camera.json").read_bytes()
     found = read(path)
     assert found.is_extended

@@ -317,8 +317,7 @@ KINDS = ParamType
 )
 def test_values_of_every_type(number: int, value: Value, raw: bytes) -> None:
     assert values.encode_ext_value(value, number) == raw
-    in_message = raw.ljust(values.EXT_VALUE_SIZE, b"\0")
-    param = values.ext_param("A", in_message, number, 3)
+    param = values.ext_param("A", raw.ljust(values.EXT_VALUE_SIZE, b"\0"), number, 3)
     assert (param.name, param.type, param.index) == ("A", number, 3)
     assert values.ext_bytes(param) == values.encode_ext_value(param.settable, number) == raw
     assert type(param.settable) is type(value)

@@ -263,11 +263,10 @@ async def test_restore_skips_measured_and_read_only_parameters() -> None:
 
 
 async def test_the_state_of_another_vehicle_is_refused() -> None:
-    other = await applied(ardupilot(uid2=b"another"), {})
     async with a_client(ardupilot()) as client:
         component = await client.component()
         with pytest.raises(UsageError, match="is that of another vehicle: the ardupilot 616e6f74686572"):
-            await restore(component, other.before)
+            await restore(component, (await applied(ardupilot(uid2=b"another"), {})).before)
         unknown = SETTINGS | {f"X_{number}": 1.0 for number in range(50)}
         with pytest.raises(UsageError, match="most parameters of the state are not on this vehicle"):
             await restore(component, unknown)

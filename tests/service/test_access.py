@@ -76,8 +76,7 @@ async def test_no_odd_token_is_valid_and_no_cookie(tokens: Any) -> None:
     wrong = [b"", b"Bearer", b"Bearer ", token, b"Basic " + token, b"Bearer " + token[:-1]]
     wrong += [b"Bearer " + token.upper(), b"Bearer \xff\xfe" + token, b"Bearer " + b"x" * 30_000]
     async with service(generic(), app={"tokens": known}) as (_, browser):
-        headers = [{b"Authorization": each} for each in wrong] + [{b"Cookie": b"token=" + token}]
-        for given in headers:
+        for given in [{b"Authorization": each} for each in wrong] + [{b"Cookie": b"token=" + token}]:
             answer = await browser.get("/api/vehicles", headers=given)
             problem(answer, 401, "unauthorized")
             assert answer.headers["www-authenticate"] == "Bearer"

@@ -180,10 +180,9 @@ def test_what_is_returned_is_what_the_command_prints(
         async with service(small_px4(), cache=cache, fetches=False) as (_, browser):
             await until(browser, V, lambda found: found["firmware"] is not None)
             wanted = {"file": {"text": file.read_text(), "name": "a.parm"}}
-            values = {"values": {"PARAM_03": 9, "NONE": 1}}
             answers = [
                 await browser.post(f"{V}/fetch", json={}),
-                await browser.patch(f"{V}/params", json=values),
+                await browser.patch(f"{V}/params", json={"values": {"PARAM_03": 9, "NONE": 1}}),
                 await browser.post(f"{V}/plan", json=wanted),
                 await browser.post(f"{V}/apply", json=wanted | {"partial": True}),
                 await browser.get(f"{V}/snapshots"),

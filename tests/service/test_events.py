@@ -66,8 +66,7 @@ async def test_a_write_is_an_event_with_its_author_and_both_values_and_an_apply_
 async def test_a_vehicle_is_told_when_it_appears_is_fetched_lost_found_and_armed() -> None:
     tap = Tap(ArduPilotVehicle())
     async with service(tap) as (_, browser), events(browser) as stream:
-        first = await stream.next("vehicle")
-        assert first["vehicle"]["state"] in ("new", "fetching")
+        assert (await stream.next("vehicle"))["vehicle"]["state"] in ("new", "fetching")
         while (event := await stream.next())["type"] != "vehicle" or event["vehicle"]["state"] != "synced":
             assert event["type"] != "change", "first values are none"
         tap.is_mute = True

@@ -10,6 +10,7 @@ import socket
 import struct
 import sys
 import tracemalloc
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
@@ -41,7 +42,7 @@ from tests.conversations.virtual import Puppet
 from tests.ground_station import Station as GroundStation
 from tests.service.ground_stations import Partner, Served, StationsLink, gateway_over
 from tests.service.hub import V, browsing
-from tests.shell import PeersLink, Radio, Tap, a_client, bits, generic, small_px4, until
+from tests.shell import Late, PeersLink, Radio, Tap, a_client, bits, generic, small_px4, until
 
 T = TypeVar("T")
 LIST = ParamRequestList(1, 1)
@@ -166,6 +167,20 @@ async def test_rule_1_a_list_that_was_asked_before_the_vehicle_was_heard_is_answ
         kinds = (*REQUESTS, FileTransfer)
         senders = {frame.system for _, frame, message in vehicle.received if isinstance(message, kinds)}
         assert senders == ({254, 255} if system else {254})
+
+
+@pytest.mark.parametrize(("system", "expected"), [(1, {1: 26}), (0, {1: 26, 2: 26})])
+async def test_rule_1_such_a_list_is_answered_by_those_of_whom_it_was_asked(
+    system: int, expected: dict[int, int]
+) -> None:
+    both = [Late(small_px4(system=2), 1.0), Late(small_px4(system=1), 2.0)]
+    async with gateway_over(Air(both)) as served:
+        station = served.partner()
+        await station.ask(ParamRequestList(system, system), seconds=3.0)
+        for number in (2, 1):
+            await (await served.clients[0].component(system=number)).fetch_all()
+        await anyio.sleep(1.0)
+        assert Counter(each.system for each in station.frames if each.message_id == 22) == expected
 
 
 # 2: answered from the table
@@ -974,6 +989,18 @@ async def test_rule_10_what_is_asked_of_all_components() -> None:
         assert requested(vehicle) == [replace(write, target_component=1)]
 
 
+async def test_rule_10_what_is_for_an_autopilot_that_is_not_served_is_not_refused_by_another_one() -> None:
+    """Its list has a name that is not stored."""
+    gimbal = generic(component=5, table={"TILT": 1.0})
+    vehicle = generic(table={"A,B": 1, "GAIN": 2}, autopilot=12)
+    async with gateway_over(Air([gimbal, vehicle])) as served:
+        station = await served.heard()
+        for each in (1, 5):
+            await (await served.clients[0].component(1, each)).fetch_all()
+        await station.ask(replace(set_to("GAIN", 9), target_component=0), seconds=3.0)
+        assert (vehicle.param("GAIN").value, station.of(messages.ParamError)) == (9, [])
+
+
 @pytest.mark.parametrize("is_one_link", [False, True])
 async def test_rule_10_two_vehicles_with_one_id(is_one_link: bool, caplog: pytest.LogCaptureFixture) -> None:
     vehicles = [Tap(small_px4()), Tap(small_px4())]
@@ -989,9 +1016,10 @@ async def test_rule_10_two_vehicles_with_one_id(is_one_link: bool, caplog: pytes
         assert len(station.of(ParamValue)) == 52
         vehicles[1].is_mute = True
         await anyio.sleep(6.0)
-        vehicles[0].received.clear()
+        for each in vehicles:
+            each.received.clear()
         assert await listed(station) == 26
-        assert not requested(vehicles[0])
+        assert not any(map(requested, vehicles))
 
 
 # 11: loops

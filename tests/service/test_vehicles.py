@@ -219,8 +219,7 @@ async def test_extended_parameters_are_set_up_and_restored(tmp_path: Path) -> No
     async with camera(cache=str(tmp_path / "cache.sqlite3")) as browser:
 
         async def ask(method: str, what: str, body: object = None, **query: Any) -> Any:
-            answer = await browser.request(method, f"{CAMERA}/{what}", params=EXT | query, json=body)
-            return answer.json()
+            return (await browser.request(method, f"{CAMERA}/{what}", params=EXT | query, json=body)).json()
 
         await ask("POST", "fetch", {})
         before, values = (await ask("GET", "params/CAM_NAME"))["value"], {"values": {"CAM_NAME": "Rear"}}

@@ -57,8 +57,7 @@ def compared(recorded: Messages) -> Messages:
         if isinstance(message, messages.Heartbeat) and message.system_status == 0:
             message = dataclasses.replace(message, system_status=3)
         if isinstance(message, messages.AutopilotVersion):
-            commit = COMMITS.get(message.git_hash, message.git_hash)
-            message = dataclasses.replace(message, git_hash=commit)
+            message = dataclasses.replace(message, git_hash=COMMITS.get(message.git_hash, message.git_hash))
         kept.append((time, message))
     return kept
 

@@ -51,8 +51,7 @@ def test_a_vehicle_acknowledges_switches_off_and_returns(make: Any, delay: float
     station.wait(20.0)
     on_at = 10.25 + delay + 5.0
     assert not [when for when, _, _ in station.log if 10.25 + delay < when < on_at]
-    started_at = [when for when, frame, _ in station.log if frame.sequence == 0][-1]
-    assert started_at == pytest.approx(on_at)
+    assert [when for when, frame, _ in station.log if frame.sequence == 0][-1] == pytest.approx(on_at)
     assert (vehicle.version, vehicle.system) == (version, 1)
 
 
