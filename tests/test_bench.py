@@ -63,8 +63,7 @@ def test_live_fails_with_check_where_a_value_is_wrong() -> None:
     vehicle = PX4Vehicle(table={"MC_ROLL_P": 6.5, "MC_AIRMODE": 3})
     vehicle.when_listed(2, lambda: vehicle.set_param("MC_AIRMODE", 2))
     with flying(vehicle) as link:
-        arguments = ["live", link, "--kind", "px4", "--seeds", "1", "--row", "clean", "--check"]
-        text = bench(*arguments, code=1)
+        text = bench("live", link, "--kind", "px4", "--seeds", "1", "--row", "clean", "--check", code=1)
     assert "PX4, clean, run 0: 1 differ: MC_AIRMODE was 3, is 2" in text
     assert " missed |" in text
 

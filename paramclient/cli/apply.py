@@ -352,8 +352,8 @@ class _Job:
             if self.state.is_restore:
                 made.check_state()
             is_refused = made.problems and not self.options["partial"]
-            is_reboot_due = self.options["reboot"] and made.awaiting_reboot
-            self.has_work = not is_refused and bool(made.to_write or is_reboot_due)
+            to_reboot_for = made.awaiting_reboot if self.options["reboot"] else ()
+            self.has_work = not is_refused and bool(made.to_write or to_reboot_for)
             return self
         raise errors.NoReply(f"the parameters of {session.label}", attempts=0, waited=left or 0.0)
 
@@ -422,7 +422,8 @@ class _Job:
                 code = ExitCode.USAGE
             remarks.append(found.firmware_note)
         elif isinstance(found, ApplyResult):
-            made, end, late = found.plan, f" in {found.elapsed:.1f} s", found.reboot_required
+            end = f"{', rebooted' * bool(found.reboots)} in {found.elapsed:.1f} s"
+            made, late = found.plan, found.reboot_required
             if found.error is not None:
                 remarks.append(f"{found.error}; {self.state.to_continue}")
                 code = max(code, code_of(found.error))

@@ -100,8 +100,7 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = CacheOpti
                 report(f"{each} has no parameters")
     if found or options.json:
         members = ("file", "system", "component", "autopilot", "params", "complete", "hash", "key")
-        rows = ([*map(each.get, members)] for each in found)
-        show({"tables": found}, members, rows, json=options.json)
+        show({"tables": found}, members, ([*map(each.get, members)] for each in found), json=options.json)
     return code
 
 

@@ -317,15 +317,14 @@ class _Run:
         """Return whether the vehicle must reboot after the stages that are done."""
         if done:
             return self._reboots_allowed and done[-1].reboot_first and bool(self._reboot_for)
-        is_reboot_due = bool(self._plan.awaiting_reboot) or self._pending_system_id() is not None
-        return self._reboots_allowed and (bool(self._reboot_for) or (is_reboot_due and not self._reboots))
+        is_due = self._reboot_for or (self._plan.awaiting_reboot and not self._reboots)
+        return self._reboots_allowed and bool(is_due)
 
     def _pending_system_id(self) -> int | None:
         """Return the system id that is set and takes effect after a reboot, or None."""
-        for row in self._plan.of(ApplyStatus.UNCHANGED):
-            if self._rules.has("system_id", row.name) and row.before != self.component.system:
-                return row.before if isinstance(row.before, int) else None
-        return None
+        wanted, awaiting = self._plan.system_id, self._plan.awaiting_reboot
+        is_pending = any(self._rules.has("system_id", each) for each in awaiting)
+        return wanted if is_pending and isinstance(wanted, int) else None
 
     # Reads
 

@@ -201,7 +201,7 @@ class Plan(Rows):
         unchecked: names of numbers to write whose range was not checked: there is no metadata of them.
         firmware: the identities of the file and of the vehicle, if both are known; else ().
         awaiting_reboot: switches that are on and whose group is missing: they take effect after a reboot,
-            and the vehicle may not have rebooted since they were set.
+            and the vehicle may not have rebooted since they were set; and a system id that is not used yet.
         system_id: the wanted system id; None without one, or if it is left out.
     """
 
@@ -342,7 +342,8 @@ class Planner:
         awaiting_reboot = self.awaiting_reboot(rows)
         hidden = tuple(map(_group_of, awaiting_reboot))
         file, own = self.wanted.identity, self.identity
-        kept = [row for row in rows.values() if row.status is not ApplyStatus.SKIPPED]
+        ids = [row for row in rows.values() if self.rules.has("system_id", row.name)]
+        unused = [r.name for r in ids if own and r.status is ApplyStatus.UNCHANGED and r.before != own.system]
         return Plan(
             rows,
             self.stages(rows),
@@ -361,8 +362,8 @@ class Planner:
                 and name not in self.described
             ),
             firmware=() if file is None or own is None else (file, own),
-            awaiting_reboot=awaiting_reboot,
-            system_id=next((r.wanted.settable for r in kept if self.rules.has("system_id", r.name)), None),
+            awaiting_reboot=(*awaiting_reboot, *unused),
+            system_id=next((r.wanted.settable for r in ids if r.status is not ApplyStatus.SKIPPED), None),
         )
 
     def row(self, wanted: WrittenParam) -> ApplyRow:

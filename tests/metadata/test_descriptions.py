@@ -268,8 +268,7 @@ ENTITIES = [
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
 def test_a_document_type_is_rejected(text: str, encoding: str) -> None:
     content = text.encode(encoding)
-    said = "document type" if encoding == "utf-8" else "neither JSON nor XML"
-    with pytest.raises(FileError, match=said):
+    with pytest.raises(FileError, match="document type" if encoding == "utf-8" else "neither JSON nor XML"):
         read_content(content, source="the file")
 
 

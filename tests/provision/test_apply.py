@@ -362,6 +362,9 @@ async def test_a_system_id_takes_effect_at_once_or_after_a_reboot(
         for each in wanted:
             result = await apply(component, {"SYSID_THISMAV": each}, include="identity")
             assert statuses(result) == {"SYSID_THISMAV": status}
+        if reboots:
+            again = await plan(component, {"SYSID_THISMAV": 7}, include="identity")
+            assert again.awaiting_reboot == ("SYSID_THISMAV",) * (status == "accepted")
     assert (result.system, vehicle.system, result.reboots) == (system, system, 0)
     if status == "accepted" and reboots is not None:
         assert result.plan.reboot_for == result.reboot_required == ("SYSID_THISMAV",) * reboots
