@@ -167,8 +167,7 @@ def test_make_knows_what_the_pages_say() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     named = set()
     for page in PAGES:
-        text = page.read_text(encoding="utf-8")
-        for code in [*re.findall(r"`(make [^`]+)`", text), *blocks(page, "sh")]:
+        for code in [*re.findall(r"`(make [^`]+)`", page.read_text(encoding="utf-8")), *blocks(page, "sh")]:
             named |= set(re.findall(r"\bmake ([a-z-]+)", code))
     assert {"demo", "test"} <= named <= targets
 

@@ -380,8 +380,8 @@ def _state_to_write(
         return replace(state, hash=None) if state.complete and not kept.complete else None
     if state.complete or update.replace or not kept.complete:
         return state
-    has_received_less = state.count == kept.count or (state.count is None and not update.params)
-    return None if has_received_less else state
+    # one that has received less stays behind
+    return None if state.count == kept.count or (state.count is None and not update.params) else state
 
 
 def _write_state(
@@ -393,6 +393,7 @@ def _write_state(
         )
         if listed < (state.count or 0):  # the other parameters were written to another file
             state = replace(state, hash=None, complete=False)
+    synced_at = max(state.synced_at or 0.0, min(kept.synced_at or 0.0, update.at + CLOCK_SLACK))
     tx.do(
         "UPDATE component SET (hash, param_count, complete, volatile_known, synced_at, file_works) ="
         " (?, ?, ?, ?, ?, ?) WHERE id = ?",
@@ -401,7 +402,7 @@ def _write_state(
             state.count,
             int(state.complete),
             int(state.volatile_known),
-            None if state.synced_at is None else time_cell(state.synced_at),
+            None if state.synced_at is None else time_cell(synced_at),
             None if state.file_works is None else int(state.file_works),
             owner,
         ),

@@ -136,7 +136,8 @@ async def _ask(
     def copies(attempt: int) -> int:
         if is_certain or attempt < singles:
             return 1
-        return max(1, min(int(requests_max() * timing.timeout(0) / PATIENCE_MIN), timing.copies))
+        most = requests_max()  # the last of which wait for longest
+        return max(1, min(int(most * timing.timeout(most if is_known else 0) / PATIENCE_MIN), timing.copies))
 
     def attempts_max() -> int:
         if channel.is_streaming:  # on a slow link, the answer is queued behind the list

@@ -249,8 +249,7 @@ class Station:
                 self._seek(frame, peer, now)
             elif peer == node.peer:
                 at = BOOT_CLOCK_OFFSETS[frame.message_id]
-                boot_ms = int.from_bytes(frame.payload[at : at + 4], "little")
-                node.boot_clock(frame.message_id, boot_ms, now)
+                node.boot_clock(frame.message_id, int.from_bytes(frame.payload[at : at + 4], "little"), now)
             return
         if isinstance(message, ParamSet | ParamExtSet):
             self._take_foreign_set(message, frame, now)

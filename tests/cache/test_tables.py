@@ -232,6 +232,12 @@ def test_a_hash_stays_with_its_table_while_it_holds(
     assert not is_kept or (table.complete, table.volatile_known, table.synced_at) == (True, True, NOW)
 
 
+def test_the_time_of_a_later_proof_by_another_program_stays(cache: ParamCache) -> None:
+    cache.save(hashed_table(1, 2, 3, at=NOW + 5))
+    cache.save(later("P_0", 9, 6, table=hashed_table(9, 2, 3).table))
+    assert cache.component("1").synced_at == NOW + 5
+
+
 def test_a_part_of_a_table_is_not_complete(cache: ParamCache) -> None:
     """The table was removed while a program still used it, which writes a single change of it."""
     cache.save(update(stored("PARAM_0", 1, index=0), table=TableState(0xCF579589, 3, complete=True)))

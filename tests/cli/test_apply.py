@@ -422,8 +422,7 @@ def test_ctrl_c_prints_the_outcomes_so_far(
     assert ("; run it again to continue" in outcome.err) == (name == "apply")
     assert any(value == 2 for value in vehicle.values.values())
     if not as_json:
-        place = 4 if name == "apply" else -1
-        shown = {row[0]: row[place] for row in outcome.rows[1:]}
+        shown = {row[0]: row[4 if name == "apply" else -1] for row in outcome.rows[1:]}
     elif name == "apply":
         assert (outcome.json["complete"], outcome.json["error"]) == (False, "interrupted")
         shown = {each: row["status"] for each, row in outcome.json["params"].items()}

@@ -228,8 +228,7 @@ async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetche
         if fetched:
             assert trusts(component) == {Trust.LIVE}, "read again from the vehicle that is there now"
         else:
-            value = component.params["PARAM_01"].value
-            assert value == 1, "another vehicle may have been received before"
+            assert component.params["PARAM_01"].value == 1, "another vehicle may have been received before"
             await component.get("PARAM_01")
     params = table_in(path, component.identity.key).params
     assert params["PARAM_01"].value == 99

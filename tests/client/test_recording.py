@@ -113,8 +113,7 @@ async def test_frames_of_both_directions_are_written(tmp_path: Path) -> None:
     assert [each.at for each in written] == sorted(each.at for each in written)
     assert before - 0.001 <= written[0].at <= written[-1].at <= time.time()
     said = recorded(path)
-    listed = {each.param_id for each in said if isinstance(each, messages.ParamValue)}
-    assert listed >= VALUES.keys()
+    assert {each.param_id for each in said if isinstance(each, messages.ParamValue)} >= VALUES.keys()
     assert [each.param_id for each in said if isinstance(each, messages.ParamSet)] == ["PARAM_01"]
 
 

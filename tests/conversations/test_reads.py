@@ -10,6 +10,7 @@ import pytest
 
 from paramclient.errors import LinkError, NoReply, ParamErrorCode, Refused, UnknownParameter
 from paramclient.model.values import ParamType, Trust
+from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read, read_many
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
@@ -57,6 +58,14 @@ async def test_silence_to_one_read_of_many_is_no_such_parameter(
             await read(session, which)
         assert (caught.value.name if isinstance(which, str) else caught.value.index) == which
         assert ("MC_ROLL_P" in str(caught.value)) is (vehicle_has_roll and which == "MC_ROLLP")
+
+
+async def test_a_misspelt_name_takes_seconds_after_a_list_with_losses() -> None:
+    air = Air.symmetric([ArduPilotVehicle(ftp=False)], loss=0.1, delay=0.005, seed=9)
+    async with talking(air) as (_, session):
+        await fetch_all(session)
+        with pytest.raises(UnknownParameter), anyio.fail_after(10.0):
+            await read(session, "NOPE")
 
 
 async def test_silence_is_no_reply_and_not_an_unknown_parameter() -> None:

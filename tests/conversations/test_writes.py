@@ -207,8 +207,7 @@ async def test_an_old_value_in_passing_proves_nothing_and_another_ones_is_no_adj
 
 async def test_a_set_of_another_station_right_behind_an_acknowledgement_is_the_later_change() -> None:
     answers = [ParamValue("A", struct.pack("<i", each), ParamType.INT32, 1, 0) for each in (6, 7)]
-    vehicle = Partial(NUMBER, on_set=lambda message: answers)
-    async with talking(vehicle) as (conversation, session):
+    async with talking(Partial(NUMBER, on_set=lambda message: answers)) as (conversation, session):
         assert (await write(session, "A", 6)).status == "accepted"
         assert [each.new and each.new.value for each in conversation.changes][-2:] == [6, 7]
 

@@ -225,8 +225,7 @@ def test_packed_files_convert_to_other_formats(name: str) -> None:
     assert all((param.default is not None) is with_defaults for param in file.sets[0].values())
     params = replace(file.sets[0], system=1, component=1)
     for form in (FileFormat.QGC, FileFormat.JSON, FileFormat.PARM, FileFormat.PCK):
-        read = back(params, form)
-        assert [param.bits_as(params[name].type or 0) for name, param in read.items()] == [
+        assert [param.bits_as(params[name].type or 0) for name, param in back(params, form).items()] == [
             param.bits_as(param.type or 0) for param in params.values()
         ]
     assert loads(dumps(params, file_format="pck"), source=name).sets == file.sets

@@ -139,9 +139,7 @@ class RealVehicle:
         """Take what the vehicle has sent over its link at the time `now`."""
         cut = [data] if self._cutter is None else [each.data for each in self._cutter.cut(data, peer)]
         for datagram in cut:
-            number = _message_id(datagram)
-            is_telemetry = number not in PARAMETER_TRAFFIC
-            if not (is_telemetry and self._conditions.drops_telemetry):
+            if _message_id(datagram) in PARAMETER_TRAFFIC or not self._conditions.drops_telemetry:
                 self._incoming.append((now, datagram))
 
     def receive(self, data: bytes, now: float) -> None:

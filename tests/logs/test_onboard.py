@@ -139,8 +139,7 @@ def test_a_cut_log_keeps_what_it_has(tmp_path: Path) -> None:
     writer.status(2_000_000)
     log = read_onboard_log(written(tmp_path, bytes(writer.data[:-3]), "cut.ulg"))
     assert log.initial["MC_ROLL_P"].value == 7.5
-    data = dataflash([*COMMON, FIX])
-    assert len(read_onboard_log(written(tmp_path, data[:-20])).initial) == 3
+    assert len(read_onboard_log(written(tmp_path, dataflash([*COMMON, FIX])[:-20])).initial) == 3
 
 
 @pytest.mark.parametrize("data", [b"", b"ULog", b"\xa3", b"ROLL_P 1\n", b"\xfd" * 40])

@@ -54,8 +54,7 @@ def test_types_are_from_the_cached_table_then_from_other_vehicles(cache: ParamCa
     hold(cache, Param("SYSID_THISMAV", 3, ParamType.INT16, 1, 3), BOOT - 1000, "uid:aabbccddeeff")
     result = anyio.run(import_onboard_log, written(tmp_path, dataflash([*COMMON, FIX])), cache)
     table = cache.component(KEY)
-    types = {name: param.type for name, param in table.params.items()}
-    assert types == {
+    assert {name: param.type for name, param in table.params.items()} == {
         "ARMING_CHECK": ParamType.INT32,
         "SYSID_THISMAV": ParamType.INT16,
         "ATC_RAT_RLL_P": ParamType.REAL32,
