@@ -59,7 +59,7 @@ class SimulatedTimeLoop(asyncio.SelectorEventLoop):
         self._settled_waiters: list[asyncio.Future[None]] = []
         self._rounds_left = 0
         self._observed_task: asyncio.Task[Any] | None = None
-        self._action: Callable[[], object] = _nothing
+        self._action: Callable[[], object] = lambda: None
 
     def time(self) -> float:
         return self.now
@@ -427,7 +427,3 @@ async def settled() -> None:
 def a_client(link: Any, **options: Any) -> ParamClient:
     """A client without a cache, unless one is given."""
     return ParamClient(link, **{"cache": False} | options)
-
-
-def _nothing() -> None:
-    return

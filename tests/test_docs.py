@@ -190,10 +190,6 @@ def subcommands(*words: str) -> Iterator[tuple[str, ...]]:
         yield from subcommands(*words, name)
 
 
-def options_of(text: str) -> set[str]:
-    return set(re.findall(r"--[a-z][a-z-]+", text))
-
-
 def test_commands_in_the_pages_exist_with_their_options() -> None:
     known = set(subcommands())
     used = set()
@@ -205,7 +201,7 @@ def test_commands_in_the_pages_exist_with_their_options() -> None:
                 names = [each for each in known if list(each) == words[: len(each)]]
                 used.update(names)
                 given = {word.partition("=")[0] for word in words if word.startswith("--")}
-                if not names or not given <= options_of(help_of(*names[0])):
+                if not names or not given <= set(re.findall(r"--[a-z][a-z-]+", help_of(*names[0]))):
                     wrong.append(f"{name_of(page)}: {line}")
     assert wrong == []
     assert used == known

@@ -21,7 +21,7 @@ import anyio.to_thread
 from fastapi.sse import ServerSentEvent
 
 from paramclient.cache import ParamCache
-from paramclient.cli.json_output import JsonObject, outcome_json, table_param_json, vehicle_json
+from paramclient.cli.json_output import JsonObject, outcome_json, table_param_json, taken, vehicle_json
 from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import Event, ParamClient
 from paramclient.client.component import Component
@@ -190,11 +190,9 @@ class Target:
             **vehicle_json(component),
             "link_state": self.link.state,
             "encoding": component.encoding.value,
-            "count": component.count,
+            **taken(component, "count", "state", "is_armed"),
             "params": len(component.params),
             "hash": hash_text(component.hash),
-            "state": component.state,
-            "is_armed": component.is_armed,
             "silence_s": round(component.silence, 3),
             "round_trip_s": rounded(component.round_trip),
             "fetch": None if now is None else {**asdict(now), "rate": round(now.rate, 1)},
@@ -291,12 +289,11 @@ class Target:
         """
         found: dict[str, Value] = {}
         faults: dict[str, str] = {}
-        component = self.component
         for name, each in given.items():
             info = self.info(name)
             value: Value | None = each
-            if isinstance(each, str) and component.is_extended:
-                known = component.params.get(name) or await component.get(name)
+            if isinstance(each, str) and self.component.is_extended:
+                known = self.component.params.get(name) or await self.component.get(name)
                 value = parse_ext_value(name, each, known.type)
             elif isinstance(each, str):
                 value = number_of(each) if info is None else info.parse(each)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Final, NamedTuple, TypeAlias
 
 import anyio
@@ -201,10 +201,11 @@ class KeptFile:
             self._opening.end((asker, request))
         if self._table.list_if_current and self._begin(asker, request, key, route):
             return
-        if self._table.is_loading and request.opcode == Opcode.OPEN_FILE_RO:
-            self._say(asker, reply(request, error=FileErrorCode.FILE_NOT_FOUND))
-        else:
-            route()
+        if request.opcode == Opcode.OPEN_FILE_RO:
+            self._keep(asker, key, None)  # and not the one that was open before
+            if self._table.is_loading:
+                route = partial(self._say, asker, reply(request, error=FileErrorCode.FILE_NOT_FOUND))
+        route()
 
     @property
     def _is_served(self) -> bool:

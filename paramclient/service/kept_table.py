@@ -242,8 +242,15 @@ class KeptTable(Stream[Change]):
         return None if key is None else self._list_at(key)
 
     def check(self) -> None:
-        """Have a table checked in the background that was not confirmed for a while."""
+        """Have a table checked in the background that was not confirmed for a while.
+
+        Nothing confirms extended parameters, nor announces a change: they are in doubt then.
+        """
         self.component.watch.check(older_than=PROOF_AGE_MAX)
+        age = anyio.current_time() - self.component.watch.confirmed_at
+        if self.session.dialect.has_ack and age > PROOF_AGE_MAX and not self.is_loading:
+            self.component.watch.unconfirmed()
+            self.session.table.doubt()
 
     def doubt(self) -> None:
         """Have the table checked, and serve none of its values before: something may have changed them."""
@@ -260,8 +267,8 @@ class KeptTable(Stream[Change]):
 
     def send_list(self, station: GroundStation) -> None:
         """Answer a request for the list: from the table, or as a fetch brings it."""
+        self.check()
         if values := self.list_if_current:
-            self.check()
             self._stream(station, values, set())
         else:
             self._listing.setdefault(station, set())
@@ -277,7 +284,7 @@ class KeptTable(Stream[Change]):
             self.send_list(station)
 
     def _stream(self, station: GroundStation, values: Iterable[ReportedValue], sent: set[int]) -> None:
-        """Send the values of one list, each as it is by then, until the component is lost or restarts.
+        """Send the values of one list, each as it is by then, until one is in doubt or the component is lost.
 
         A heartbeat precedes the first one: a station may ask before it has heard one, and MAVProxy does not
         decode a PX4's integers then, although it would hear one while the vehicle itself answers.
@@ -291,11 +298,12 @@ class KeptTable(Stream[Change]):
 
         def current() -> Iterator[Message]:
             for value in values:
-                if self.is_lost or self.component.node.generation != generation:
+                param = self.session.table.params.get(value.param_id)
+                is_doubtful = param is not None and param.trust is Trust.CACHED
+                if is_doubtful or self.is_lost or self.component.node.generation != generation:
                     return
                 if not sent and self.heartbeat is not None:
                     yield self.heartbeat
-                param = self.session.table.params.get(value.param_id)
                 if self.changes != changes and param is not None:
                     now = value_of(self.session, param, index=value.param_index)
                     value = now._replace(param_count=value.param_count)
@@ -354,8 +362,8 @@ class KeptTable(Stream[Change]):
 
     def read(self, asker: Asker, which: Which) -> None:
         """Answer a read; the vehicle is asked for what the table does not have."""
+        self.check()
         if value := self.known(which):
-            self.check()
             asker.station.say(value, self.source)
         elif self._is_unknown(which):
             self._refuse([asker], which, ParamErrorCode.DOES_NOT_EXIST)

@@ -494,8 +494,7 @@ async def history(
     since: Annotated[AwareDatetime | None, Query(description="Only from this time on.")] = None,
 ) -> JsonObject:
     """Return the newest changes of values, the newest last."""
-    begin = None if since is None else since.timestamp()
-    entries = await target.cached(ParamCache.history, name, limit, begin)
+    entries = await target.cached(ParamCache.history, name, limit, since and since.timestamp())
     return {"history": [json_output.history_json(each) for each in entries]}
 
 

@@ -13,6 +13,7 @@ from typing import Any, Final, TypeAlias
 import anyio
 import anyio.abc
 
+from paramclient.cli.json_output import taken
 from paramclient.client.signing import Signing, read_key
 from paramclient.client.taps import FrameCutter, SeenFrame
 from paramclient.errors import LinkError, UsageError
@@ -163,9 +164,7 @@ class GroundStation:
             "mavlink": self.version,
             "silence_s": round(self.silence, 3),
             "requests": dict(self.requests),
-            "relayed": self.relayed,
-            "answered": self.answered,
-            "dropped": self.dropped,
+            **taken(self, "relayed", "answered", "dropped"),
             "saved_bytes": self.saved,
         }
 
@@ -256,9 +255,8 @@ class GroundStation:
         return None
 
     def _inserted(self, source: Source, message: Message, is_answer: bool) -> bytes:
-        number = self._numbering[source].insert()
-        system, component = source
-        data = encode(message, system=system, component=component, sequence=number, version=self.version)
+        ids = {"system": source[0], "component": source[1], "sequence": self._numbering[source].insert()}
+        data = encode(message, version=self.version, **ids)
         if self.endpoint.signer is not None:
             data = sign_frame(data, self.endpoint.signer)
         self.answered += is_answer

@@ -206,9 +206,8 @@ def test_earlier_observations_are_inserted_by_time(cache: ParamCache) -> None:
     cache.save(whole_table(2))
     change(cache, 5, 100, by="us")
     logged = (("OLD", -50, 1), ("PARAM_0", 50, 3), ("PARAM_0", 60, 0), ("PARAM_0", 99, 5))
-    log = [update(stored(name, value, at=NOW + at), at=NOW + at) for name, at, value in logged]
     for _ in range(2):  # repeating it changes nothing
-        cache.merge(log)
+        cache.merge([update(stored(name, value, at=NOW + at), at=NOW + at) for name, at, value in logged])
         assert values(cache) == {"PARAM_0": 5, "PARAM_1": 1}
         assert lines(cache) == [
             (50, "PARAM_0", 0, 3, "vehicle"),

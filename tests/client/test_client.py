@@ -54,11 +54,6 @@ async def first_change(component: Component) -> Change:
     return await anext(component.changes())
 
 
-def under_way(client: ParamClient, component: Component) -> dict[str, asyncio.Task[object]]:
-    """All calls, each in a task of its own."""
-    return {name: asyncio.create_task(shell.outcome(call(client, component))) for name, call in CALLS.items()}
-
-
 # Life and death
 
 
@@ -395,7 +390,8 @@ async def test_a_link_that_stays_disconnected_fails_only_calls(caplog: pytest.Lo
     link = shell.FlakyLink(tap)
     async with connected(link) as (client, component):
         tap.is_mute = True
-        waiting = under_way(client, component)
+        calls = {name: shell.outcome(call(client, component)) for name, call in CALLS.items()}
+        waiting = {name: asyncio.create_task(call) for name, call in calls.items()}
         await shell.settled()
         changes, events = waiting.pop("changes"), waiting.pop("client.events")
         limited = asyncio.create_task(shell.outcome(component.get("PARAM_05", timeout=2)))

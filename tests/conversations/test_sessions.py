@@ -166,14 +166,9 @@ class Sessions(RuleBasedStateMachine):
             assert not session.writing
             held = {name: each.bits for name, each in session.table.params.items()}
             assert held == {name: each.bits for name, each in vehicle.params.items()}
-            if vehicle_has_files(vehicle):
+            if isinstance(vehicle, ArduPilotVehicle):  # which has MAVFTP
                 await anyio.sleep(4.0)
                 assert vehicle.open_files == []
-
-
-def vehicle_has_files(vehicle: Vehicle) -> bool:
-    """Return whether a vehicle has MAVFTP."""
-    return isinstance(vehicle, ArduPilotVehicle)
 
 
 def test_sessions_end_with_the_vehicles_table() -> None:

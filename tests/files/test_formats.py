@@ -172,8 +172,7 @@ def test_qgroundcontrol_reads_every_parameter_line() -> None:
     lines = dumps([pilot, camera], file_format="qgc").decode().splitlines()
     assert lines[0] == "# Onboard parameters for Vehicle 1"
     assert "# Vehicle-Id Component-Id Name Value Type" in lines
-    rows = [line.split("\t") for line in lines if line and not line.startswith("#")]
-    assert rows == [
+    assert [line.split("\t") for line in lines if line and not line.startswith("#")] == [
         ["1", "1", "A", "0.1", "9"],
         ["1", "1", "B", "-5", "6"],
         ["1", "1", "C", "-inf", "9"],

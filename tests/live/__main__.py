@@ -55,8 +55,7 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
     """Give the lines of a Markdown table."""
     head = Row("check", "measured", "the documentation promises", "result")
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-    rule = Row(*("-" * width for width in widths))
-    for row in (head, rule, *rows):
+    for row in (head, Row(*("-" * width for width in widths)), *rows):
         yield f"| {' | '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))} |"
 
 

@@ -48,10 +48,6 @@ def reads_of(tap: Tap) -> int:
     return len(tap.messages(FileTransfer))
 
 
-async def files_in(folder: Path) -> list[Path]:
-    return await anyio.to_thread.run_sync(lambda: sorted(folder.iterdir()))
-
-
 # Complete downloads
 
 
@@ -72,7 +68,7 @@ async def test_a_vehicle_describes_its_parameters() -> None:
 
 
 async def test_a_cached_file_is_not_downloaded_again(tmp_path: Path) -> None:
-    cache = tmp_path / "cache.sqlite3"
+    cache, folder = tmp_path / "cache.sqlite3", tmp_path / "cache.metadata"
     for expected in (True, False):
         tap = Tap(describing())
         async with a_client(tap, cache=str(cache)) as client:
@@ -81,8 +77,7 @@ async def test_a_cached_file_is_not_downloaded_again(tmp_path: Path) -> None:
             read = await metadata_of(component)
             assert read is not None
             assert (reads_of(tap) > before) is expected
-            folder = tmp_path / "cache.metadata"
-            kept = await files_in(folder)
+            kept = await anyio.to_thread.run_sync(lambda: [*folder.iterdir()])
             assert len(kept) == 3
             assert {stat.S_IMODE(path.stat().st_mode) for path in kept} == {0o600}
             assert stat.S_IMODE(folder.stat().st_mode) == 0o700

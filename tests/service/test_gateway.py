@@ -285,6 +285,19 @@ async def test_rule_2_extended_parameters() -> None:
         assert station.of(messages.ParamExtAck) == [replace(acknowledged, param_result=1)]
 
 
+async def test_rule_2_extended_parameters_are_asked_of_the_camera_again_after_a_moment() -> None:
+    """Nothing announces or confirms them."""
+    whole: messages.Message = messages.ParamExtRequestList(1, 100)
+    one = messages.ParamExtRequestRead(1, 100, "CAM_ISO", -1)
+    async with gateway_over(camera := Camera()) as served:
+        station = await served.heard()
+        for value, request in enumerate((whole, one, whole), 3200):
+            camera.set_ext_param("CAM_ISO", value)
+            await station.ask(request, seconds=10.0)
+            sent = {each.raw[:4] for each in station.of(messages.ParamExtValue) if each.param_id == "CAM_ISO"}
+            assert sent == {struct.pack("<I", value)}
+
+
 def direct_file(path: str, size: int) -> bytes:
     """A file as the simulated vehicle serves it."""
     opening = Packet(1, 0, Opcode.OPEN_FILE_RO, path.encode())
@@ -333,6 +346,8 @@ async def test_rule_2_a_repeated_opening_has_the_same_answer_when_the_table_is_i
         (await served.clients[0].component()).watch.doubt()
         await anyio.sleep(0.05)
         assert opened == await opening() != []
+        await opening(sequence=9, seconds=5.0)  # fails, or passes and opens another file
+        assert not await station.ask_file(Opcode.READ_FILE, size=80)
 
 
 async def test_rule_2_the_file_of_a_px4_is_padded_for_pieces_of_239_bytes() -> None:
@@ -598,9 +613,9 @@ async def test_rule_3_a_lost_vehicle_is_silent() -> None:
 
 
 async def test_rule_3_a_component_without_heartbeats_is_lost_after_a_minute() -> None:
-    ask = messages.ParamExtRequestList(1, 100)
     value = messages.ParamExtValue("A", bytes(128), ParamType.UINT8, 1, 0)
-    vehicle = Puppet(lambda message: [value] * (message == ask), heartbeat=None, component=100)
+    asks = (messages.ParamExtRequestList, messages.ParamExtRequestRead)
+    vehicle = Puppet(lambda each: [value] * isinstance(each, asks), heartbeat=None, component=100)
     async with gateway_over(vehicle) as served:
         vehicle.say(value)
         station = served.partner()
@@ -1240,6 +1255,13 @@ async def test_a_silent_reset_by_a_station_is_found() -> None:
             await station.ask(LIST, ParamRequestRead(1, 1, "PARAM_01", -1), seconds=3.0)
             values = {each.raw for each in station.of(ParamValue) if each.param_id == "PARAM_01"}
             assert values == {struct.pack("<i", value)}
+
+
+async def test_a_silent_reset_ends_a_list() -> None:
+    async with in_sync(PX4Vehicle()) as (_, _, station):
+        await station.ask(LIST, seconds=0.01)
+        await station.ask(messages.CommandLong(1, 1, messages.MAV_CMD_PREFLIGHT_STORAGE, 2.0), seconds=0.03)
+        assert len(station.of(ParamValue)) <= 37
 
 
 async def test_a_restart_during_a_list() -> None:
