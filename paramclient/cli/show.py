@@ -157,9 +157,8 @@ def info(
         cells = map(param.get, ("value", "text", "type", "default", "default_source"))
         rows.append((f"{table.system}/{table.component}", *cells, local_time(heard), table.key))
     if options.json:
-        output.print_json(
-            {"name": spelled, "metadata": next(map(info_json, infos), None), "vehicles": vehicles}
-        )
+        one = info_json(infos[0]) if len(infos) == 1 else None  # vehicles may have different ones
+        output.print_json({"name": spelled, "metadata": one, "vehicles": vehicles})
         return ExitCode.DONE
     for info in (*infos,) or (None,):
         of = [f"{each.system}/{each.component}" for each, own in known.having(spelled) if own == info]

@@ -36,8 +36,8 @@ NAMES_SHOWN_MAX: Final = 20
 """Parameters that a message names, so that it stays readable; it gives the number of further ones."""
 NO_DEFAULTS: Final = (
     "the firmware's defaults are not known: they come with the parameter file over MAVFTP, which ArduPilot "
-    "and PX4 from 1.18 on serve, or with the metadata of the firmware, which `paramclient fetch LINK "
-    "--metadata vehicle` and `paramclient metadata add FILE` store"
+    "and PX4 from 1.18 on serve and `paramclient fetch LINK --refresh` takes, or with the metadata of the "
+    "firmware, which `paramclient fetch LINK --metadata vehicle` and `paramclient metadata add FILE` store"
 )
 """The message for a request that needs the firmware's defaults when no parameter has one."""
 _CACHED: Final = "cache:"
@@ -276,10 +276,10 @@ def part_set(component: Component, params: Collection[Param], source: str, lacks
     table = component.session.table
     twice = [f"a second {name}" for name, number in Counter(table.names.values()).items() if number > 1]
     names = [*lacks, *map(repr, sorted(table.left_out)), *twice]
-    size, count = len(params), component.count or 0
-    # of a list whose count has changed, indices may be those of the earlier one; an acknowledgement has none
-    of = f" of {count} parameters," if size + len(names) <= count else f" parameters; of the list of {count}"
-    words = f"{size}{of} without {first_of(names, NAMES_SHOWN_MAX)}"
+    listed, count = sum(each.index is not None for each in params) + len(names), component.count or 0
+    # of a list whose count has changed, indices may be those of the earlier one
+    of = f" of {count} parameters," if listed <= count else f" parameters; of the list of {count}"
+    words = f"{len(params)}{of} without {first_of(names, NAMES_SHOWN_MAX)}"
     return component_set(component, params, source, words if names else "")
 
 

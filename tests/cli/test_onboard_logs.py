@@ -30,7 +30,8 @@ def test_logs_of_every_format_are_compared(command: Command, tmp_path: Path) -> 
     assert (outcome.code, outcome.json["left"]["count"], outcome.json["right"]["count"]) == (1, 903, 850)
     assert outcome.json["left"]["at"].startswith("2026-11-20"), "when the values were received"
     assert len(command("show", telemetry, "--json").json["components"][0]["params"]) == 903
-    assert "(incomplete: 23 of 908 parameters, " in command("show", DATA / "px4_20_sets.tlog").err
+    for name, words in (("px4_20_sets", "23 of 908"), ("ardupilot_30_sets", "30 of 1382")):
+        assert f"(incomplete: {words} parameters, " in command("show", DATA / f"{name}.tlog").err
     changed = command("show", DATA / "ardupilot_enable_groups.tlog").err
     assert "(incomplete: 1402 parameters; of the list of 1382 without index 0, " in changed
     saved = command("save", telemetry, tmp_path / "quad.param")

@@ -490,9 +490,8 @@ def test_two_programs_share_vehicles_and_a_cache(tmp_path: Path) -> None:
     table = [SimParam(f"P_{index:03}", ParamType.INT32, index) for index in range(300)]
     vehicles = [PX4Vehicle(system=system, table=table) for system in (1, 2)]
     with flying(Air(vehicles)) as url:
-        program = [sys.executable, "-c", PROGRAM, url, str(path)]
         running = [
-            subprocess.Popen([*program, *words])
+            subprocess.Popen([sys.executable, "-c", PROGRAM, url, str(path), *words])
             for words in (("P_100", "7", "8", "9"), ("P_200", "17", "18", "19"))
         ]
         assert [each.wait(60) for each in running] == [0, 0]
