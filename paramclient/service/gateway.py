@@ -159,17 +159,17 @@ class Gateway:
     def _answer(self, station: GroundStation, source: Source, message: Request, seen: SeenFrame) -> bool:
         """Answer a request about parameters; return False for one that passes to the vehicles.
 
-        One to whichever vehicle passes if there are several, or if it is for the autopilot, which is not
-        served. Before one is heard, such a request does not pass: the vehicle would send its list, or open
-        its file, beside the gateway's own fetch.
+        One to whichever vehicle passes if there are several; one that may be for the autopilot does, also
+        beside answers of others, if that is not served. Before one is heard, such a request does not pass:
+        the vehicle would send its list, or open its file, beside the gateway's own fetch.
         """
         address = (message.target_system, message.target_component)
         extended = isinstance(message, EXTENDED_REQUESTS)
         found = {table: link for link in self.links for table in link.tables(*address, extended=extended)}
         served = [table for table, link in found.items() if self._serves(station, table, link)]
         autopilots = [table for table in found if table.source[1] == messages.AUTOPILOT_COMPONENT]
-        is_for_one = len({table.source[0] for table in found}) == 1 and {*autopilots} <= {*served}
-        if not served or not (is_for_one or isinstance(message, ListRequest)):
+        systems = {table.source[0] for table in found}
+        if not served or (len(systems) > 1 and not isinstance(message, ListRequest)):
             if isinstance(message, ListRequest):
                 station.list_asked = (anyio.current_time(), address, extended, set())
             return not (found or message.target_system)
@@ -194,7 +194,7 @@ class Gateway:
             case messages.FileTransfer(payload=payload):
                 for table in one:
                     return found[table].file(table).take(asker, payload, lambda: self._pass(station, seen))
-        return True
+        return {*autopilots} <= {*served} or isinstance(message, ListRequest)
 
     def _serves(self, station: GroundStation, table: KeptTable, link: VehicleLink) -> bool:
         """Return whether requests of a station to a component are answered from its table."""
