@@ -334,7 +334,7 @@ def _unrecorded(
         for number, line in recent.get(item.name, ()):
             is_near = number > last and line.at > item.heard_at - SAME_CHANGE_MAX
             if is_near and is_same_value(line.new, item.stored):
-                if line.by == BY_VEHICLE:  # the other program may not know who has set it
+                if line.by == BY_VEHICLE != item.by:  # the other program does not know who has set it
                     tx.do("UPDATE history SET author = ? WHERE id = ?", (item.by, number))
                 known[owner, item.name] = (number, 0.0)
                 kept[item.name] = []

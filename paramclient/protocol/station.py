@@ -31,8 +31,8 @@ HEARTBEAT_INTERVAL: Final = 1.0
 """Seconds between two heartbeats of ours, by the standard."""
 PROBES: Final = 13
 """Turns of a search for a component that was not heard."""
-PROBES_OWN: Final = 7
-"""The first of them, in which the answers are to requests under its own address."""
+PROBES_OTHER: Final = range(7, 10)
+"""Those in which another address is asked; from the first of them on, the answers are to these requests."""
 COMPONENTS_MAX: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each."""
 STREAM_PEERS_MAX: Final = 256
@@ -161,7 +161,7 @@ class Station:
             1: PLAIN.request_list(target),
             2: PLAIN.request_read(target, 1),
             3: EXTENDED.request_read(target, 0),
-            **dict.fromkeys((7, 8, 9), PLAIN.request_read((system, messages.AUTOPILOT_COMPONENT), 0)),
+            **dict.fromkeys(PROBES_OTHER, PLAIN.request_read((system, messages.AUTOPILOT_COMPONENT), 0)),
         }
         if number in ways:
             self.transmit(ways[number], None, next((node.version for node in self.nodes.values()), 2))
@@ -258,7 +258,7 @@ class Station:
             if not isinstance(message, _SIGNS) or len(self.nodes) >= COMPONENTS_MAX:
                 return
             node = self._add(address, peer, now)
-            is_other = self._asked.get((system, component), 0) >= PROBES_OWN
+            is_other = self._asked.get((system, component), 0) >= PROBES_OTHER.start
             if is_other and isinstance(message, messages.ParamValue):  # the answer to a probe
                 node.channel.reads_from = (system, messages.AUTOPILOT_COMPONENT)
         if peer != node.peer:
