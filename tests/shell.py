@@ -11,7 +11,7 @@ import time
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 from unittest import mock
 
 import anyio
@@ -187,33 +187,54 @@ def generic(**options: Any) -> GenericVehicle:
     return GenericVehicle(**{"table": VALUES} | options)
 
 
+def decoded(data: bytes) -> list[tuple[frames.Frame, messages.Message]]:
+    """The frames in a datagram that are understood, and their messages."""
+    found = frames.Framer(messages.DECODED_IDS, stream=False).receive(data)
+    return [(frame, message) for frame in found if (message := messages.decode(frame)) is not None]
+
+
+Passes: TypeAlias = Callable[[messages.Message], bool]
+"""Returns whether a message arrives."""
+
+
+def all_pass(message: messages.Message) -> bool:
+    """The link loses nothing."""
+    return True
+
+
 class Tap:
     """An endpoint through which another one speaks: it listens, and can hold either direction up.
 
+    Args:
+        endpoint: the vehicle; another one may take its place.
+        up, down: of a message to the vehicle, and from it.
+
     Attributes:
-        received: what the station has sent: time, frame, message.
+        received: what the station has sent, if it may arrive: time, frame, message.
         is_deaf: the endpoint receives nothing.
         is_mute: nothing that it sends arrives.
+        silent_at: from when on both hold, on the clock of the event loop, as of a vehicle that crashes.
     """
 
-    def __init__(self, endpoint: Endpoint) -> None:
+    def __init__(self, endpoint: Endpoint, *, up: Passes = all_pass, down: Passes = all_pass) -> None:
         self.received: list[tuple[float, frames.Frame, messages.Message]] = []
+        self.up = up
+        self.down = down
         self.is_deaf = False
         self.is_mute = False
+        self.silent_at = math.inf
         self.endpoint = endpoint
-        self._framer = frames.Framer(messages.DECODED_IDS, stream=False)
 
     def messages(self, kind: type[T]) -> list[T]:
         """What the station has sent, of one kind."""
         return [message for _, _, message in self.received if isinstance(message, kind)]
 
     def receive(self, data: bytes, now: float) -> None:
-        for frame in self._framer.receive(data):
-            message = messages.decode(frame)
-            assert message is not None
-            self.received.append((now, frame, message))
-        if not self.is_deaf:
-            self.endpoint.receive(data, now)
+        heard = decoded(data)
+        if all(self.up(message) for _, message in heard):
+            self.received += [(now, *each) for each in heard]
+            if not self.is_deaf and now < self.silent_at:
+                self.endpoint.receive(data, now)
 
     def tick(self, now: float) -> None:
         self.endpoint.tick(now)
@@ -222,8 +243,10 @@ class Tap:
         return self.endpoint.next_deadline()
 
     def data_to_send(self) -> list[bytes]:
-        data = self.endpoint.data_to_send()
-        return [] if self.is_mute else data
+        sent = self.endpoint.data_to_send()
+        if self.is_mute or anyio.current_time() >= self.silent_at:
+            return []
+        return [data for data in sent if all(self.down(message) for _, message in decoded(data))]
 
 
 class Late:

@@ -10,6 +10,7 @@ import pytest
 from paramclient.sim import GenericVehicle, PX4Vehicle
 from paramclient.wire.messages import Heartbeat, Message
 from tests.commands import Command, Put
+from tests.shell import Tap
 
 URL = "sim:custom"
 
@@ -64,14 +65,10 @@ def test_only_another_station_is_received(command: Command, put: Put) -> None:
 
 
 def test_a_vehicle_that_falls_silent(command: Command, put: Put) -> None:
-    class Dying(GenericVehicle):
-        """A vehicle that is switched off by the first request."""
-
-        def data_to_send(self) -> list[bytes]:
-            frames = super().data_to_send()
-            return [] if self.requests["PARAM_REQUEST_READ"] else frames
-
-    done = command("get", put(Dying({"A": 1})), "A")
+    """It is switched off by the first request."""
+    vehicle = GenericVehicle({"A": 1})
+    dying = Tap(vehicle, down=lambda message: not vehicle.requests["PARAM_REQUEST_READ"])
+    done = command("get", put(dying), "A")
     assert done.code == 3
     assert "Nothing was received of 1/1 for " in done.err
 

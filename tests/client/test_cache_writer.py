@@ -30,7 +30,6 @@ from paramclient.wire import messages
 from tests import shell
 from tests.caches import read_only
 from tests.client.conftest import connected, fetched, table_in
-from tests.conversations.virtual import Tap as Filter
 from tests.simulated_on_udp import flying
 
 ODD = ("CAL_ACC0_XOFF", "PARAM_03", "PARAM_07")
@@ -179,7 +178,7 @@ async def test_another_vehicle_takes_the_place_within_a_session(path: Path, know
 
 async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
     vehicle = PX4Vehicle(table=shell.VALUES)
-    link = Filter(vehicle, up=is_no_command)
+    link = shell.Tap(vehicle, up=is_no_command)
     async with ParamClient(link, cache=path) as client:
         began = anyio.current_time()
         component = await client.component()
@@ -210,7 +209,7 @@ async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
 async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetched: bool) -> None:
     await session(PX4Vehicle(table=shell.VALUES), path)
     changed = PX4Vehicle(table={**shell.VALUES, "PARAM_01": 99}, not_in_use=["PARAM_02"])
-    link = Filter(changed, up=is_no_command)
+    link = shell.Tap(changed, up=is_no_command)
     tap = shell.Tap(link)
     async with connected(tap, cache=path) as (_, component):
         if fetched:
@@ -352,7 +351,7 @@ async def test_a_value_announced_just_before_the_file_was_read_keeps_its_index(p
             vehicle.set_param("RTL_ALT", 4321)
         return True
 
-    first = await session(Air.symmetric([Filter(vehicle, up=passes)], delay=0.05), path)
+    first = await session(Air.symmetric([shell.Tap(vehicle, up=passes)], delay=0.05), path)
     second = await session(vehicle, path)
     assert (first.source, second.source, second.params["RTL_ALT"].value) == ("ftp", "cache", 4321)
 

@@ -31,8 +31,6 @@ from tests import shell
 from tests.client.conftest import connected, fetched, table_in
 from tests.conversations.test_fetch import new_vehicle
 from tests.conversations.test_writes import free_names
-from tests.conversations.virtual import Silence
-from tests.conversations.virtual import Tap as Filter
 
 VOLATILE = {"CAL_ACC0_XOFF", "PARAM_03"}
 TIME_MAX = 7.0
@@ -302,7 +300,7 @@ async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, a
         stranger = shell.small_px4(uid=2)
         stranger.set_param("PARAM_01", 1001)
         filters = [
-            Filter(each, down=lambda message: not isinstance(message, messages.AutopilotVersion))
+            shell.Tap(each, down=lambda message: not isinstance(message, messages.AutopilotVersion))
             for each in (stranger, shell.generic(component=100, uid=2, table={"PARAM_01": 1001}))
         ]
         berth.endpoint, camera.endpoint = filters
@@ -410,10 +408,10 @@ async def test_a_stream_of_events_outlives_a_cancelled_wait_and_has_a_bound_and_
             await anext(each)
 
 
-def silent_on(kind: str, delay: float = 0.05) -> tuple[Vehicle, Silence, dict[str, Value]]:
+def silent_on(kind: str, delay: float = 0.05) -> tuple[Vehicle, shell.Tap, dict[str, Value]]:
     """A vehicle, its link, on which it can go silent, and new values that no firmware limits."""
     vehicle = new_vehicle(kind)
-    endpoint = Silence(Air.symmetric([vehicle], delay=delay), at=1e9)
+    endpoint = shell.Tap(Air.symmetric([vehicle], delay=delay))
     return vehicle, endpoint, {name: 0.25 + number for number, name in enumerate(free_names(vehicle))}
 
 
@@ -430,9 +428,9 @@ async def test_a_vehicle_that_is_lost_ends_a_fetch_with_what_came(kind: str, kno
             vehicle.set_param(name, value)
     async with connected(endpoint, cache=path) as (_, component):
         await anyio.sleep(2.0)
-        endpoint.at = anyio.current_time() + 0.45
+        endpoint.silent_at = anyio.current_time() + 0.45
         result = await component.fetch_all(refresh=known)
-        assert anyio.current_time() < endpoint.at + TIME_MAX
+        assert anyio.current_time() < endpoint.silent_at + TIME_MAX
         assert (result.complete, result.hash) == (False, None)
         assert "The component was lost." in result.notes
         assert 50 < result.received == len(result.params) - len(result.cached) < result.count
@@ -444,7 +442,7 @@ async def test_a_vehicle_that_is_lost_ends_a_fetch_with_what_came(kind: str, kno
         assert {name for name, each in values if not each.same_value(vehicle.param(name))} <= set(
             result.cached
         )
-        endpoint.at = 1e9
+        endpoint.silent_at = math.inf
         await anyio.sleep(2.0)
         assert component.sync_state is SyncState.UNSYNCED
     assert table_in(path, system=1).synced_at == synced_at
@@ -459,11 +457,11 @@ async def test_a_vehicle_that_is_lost_ends_set_many(kind: str, delay: float, pat
     def fall_silent(outcome: SetOutcome) -> None:
         seen.append(outcome)
         if len(seen) == 20:
-            endpoint.at = anyio.current_time()
+            endpoint.silent_at = anyio.current_time()
 
     async with fetched(endpoint, cache=path) as (_, component):
         result = await component.set_many(wanted, progress=fall_silent)
-        assert anyio.current_time() < endpoint.at + TIME_MAX
+        assert anyio.current_time() < endpoint.silent_at + TIME_MAX
         assert isinstance(result.error, errors.NoReply)
         assert sorted(each.name for each in seen) == sorted(wanted)
         assert result.counts.keys() == {SetStatus.ACCEPTED, SetStatus.UNKNOWN, SetStatus.NOT_TRIED}

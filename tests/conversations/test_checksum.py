@@ -34,7 +34,8 @@ from paramclient.wire.messages import (
     ParamValue,
     encode,
 )
-from tests.conversations.virtual import Conversation, Tap, converse, run, virtual_on_both
+from tests.conversations.virtual import Conversation, converse, run, virtual_on_both
+from tests.shell import Tap
 
 MOVED = ("INS_GYROFFS_X", "INS_GYR2OFFS_Z", "BARO1_GND_PRESS", "STAT_RUNTIME", "STAT_BOOTCNT")
 

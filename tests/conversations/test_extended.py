@@ -18,6 +18,7 @@ from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, Camera, Endpoint, PX4Vehicle
 from paramclient.wire import messages
 from tests.conversations import virtual
+from tests.shell import Tap
 
 CAMERA = (1, 100)
 
@@ -80,7 +81,7 @@ async def test_progress_extends_the_wait_and_a_lost_result_is_requested_again(se
     def is_result(message: messages.Message) -> bool:
         return isinstance(message, messages.ParamExtAck) and message.param_result == 0
 
-    endpoint = virtual.Tap(Camera(slow={"CAM_MODE": seconds}))
+    endpoint = Tap(Camera(slow={"CAM_MODE": seconds}))
     async with filming(endpoint) as (_, session):
         result = await write(session, "CAM_MODE", 2)
         assert (result.actual, result.attempts) == (2, 1)
@@ -96,12 +97,12 @@ async def test_progress_extends_the_wait_and_a_lost_result_is_requested_again(se
 @virtual.virtual_on_both
 @pytest.mark.parametrize("after", [0.5, 1.9, 2.1])
 async def test_a_camera_that_is_lost_while_it_reports_progress_ends_the_set(after: float) -> None:
-    endpoint = virtual.Silence(Camera(slow={"CAM_MODE": 10.0}), at=1e9)
+    endpoint = Tap(Camera(slow={"CAM_MODE": 10.0}))
     async with filming(endpoint) as (_, session):
         await fetch_all(session)
-        endpoint.at = anyio.current_time() + after
+        endpoint.silent_at = anyio.current_time() + after
         result = await write_many(session, [("CAM_MODE", 2), ("CAM_ISO", 200)])
-        assert anyio.current_time() - endpoint.at < 6.0
+        assert anyio.current_time() - endpoint.silent_at < 6.0
         assert [each.status for each in result.outcomes] == [SetStatus.UNKNOWN, SetStatus.ACCEPTED]
         assert isinstance(result.error, errors.NoReply)
 

@@ -13,7 +13,8 @@ from paramclient.model.values import ParamType, Trust
 from paramclient.protocol.fetch import FetchResult, fetch_all
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle, px4_table
 from paramclient.wire import messages
-from tests.conversations.virtual import Silence, Tap, converse, meanwhile, run, talking, virtual_on_both
+from tests.conversations.virtual import converse, meanwhile, run, talking, virtual_on_both
+from tests.shell import Tap
 
 
 def new_vehicle(kind: str, **options: object) -> Vehicle:
@@ -96,13 +97,13 @@ async def test_a_refresh_downloads_also_where_the_hash_is_being_asked() -> None:
 
 @virtual_on_both
 async def test_a_vehicle_that_is_lost_after_its_hash_is_told_as_lost() -> None:
-    endpoint = Silence(Air.symmetric([PX4Vehicle()], delay=0.3), at=1e9)
+    endpoint = Tap(Air.symmetric([PX4Vehicle()], delay=0.3))
     async with talking(endpoint) as (_, session):
         await fetch_all(session)
         session.table.doubt()  # as at the next start
-        endpoint.at = anyio.current_time() + 0.65
+        endpoint.silent_at = anyio.current_time() + 0.65
         result = await fetch_all(session)
-        assert anyio.current_time() - endpoint.at < 7.0
+        assert anyio.current_time() - endpoint.silent_at < 7.0
         assert "The component was lost." in result.notes
         assert session.table.volatile
         (left,) = [note for note in result.notes if "outside the vehicle's hash" in note]

@@ -19,8 +19,8 @@ from paramclient.protocol.param_pck import PackedParam, encode
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire.messages import FileTransfer, Message, ParamValue
 from paramclient.wire.messages import encode as frame
-from tests.conversations.virtual import Silence, Tap, losing, meanwhile, talking, virtual_on_both
-from tests.shell import bits
+from tests.conversations.virtual import losing, meanwhile, talking, virtual_on_both
+from tests.shell import Tap, bits
 
 BOTH = pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
 Maker = type[PX4Vehicle] | type[ArduPilotVehicle]
@@ -134,9 +134,9 @@ async def test_the_session_of_another_station_is_waited_for() -> None:
 
 
 async def test_a_silent_server_is_no_reply_and_a_file_that_is_cut_off_keeps_its_beginning() -> None:
-    endpoint = Silence(serving(), at=1e9)
+    endpoint = Tap(serving())
     async with talking(endpoint) as (_, session):
-        endpoint.at = began = anyio.current_time() + 0.5
+        endpoint.silent_at = began = anyio.current_time() + 0.5
         with pytest.raises(FileCutOff) as caught:
             await read_file(session.channel, "a.bin")
         assert anyio.current_time() - began < 10.0

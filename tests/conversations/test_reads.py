@@ -15,7 +15,8 @@ from paramclient.protocol.reads import read, read_many
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.wire.messages import Message, ParamError, ParamRequestRead, ParamValue
-from tests.conversations.virtual import Puppet, Silence, converse, meanwhile, talking, virtual_on_both
+from tests.conversations.virtual import Puppet, converse, meanwhile, talking, virtual_on_both
+from tests.shell import Tap
 
 TABLE = {"RTL_ALT": 1500, "MC_ROLL_P": 6.5, "MC_PITCH_P": 6.5}
 MAKERS = {
@@ -69,7 +70,8 @@ async def test_a_misspelt_name_takes_seconds_after_a_list_with_losses() -> None:
 
 
 async def test_silence_is_no_reply_and_not_an_unknown_parameter() -> None:
-    async with talking(Silence(PX4Vehicle(), at=0.5)) as (_, session):
+    async with talking(endpoint := Tap(PX4Vehicle())) as (_, session):
+        endpoint.silent_at = 0.5
         await anyio.sleep(0.6)
         with pytest.raises(NoReply, match="MC_ROLL_P of 1/1") as caught:
             await read(session, "MC_ROLL_P")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
@@ -21,7 +22,8 @@ from paramclient.protocol.reads import read
 from paramclient.protocol.session import Session
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
-from tests.conversations.virtual import Silence, converse, run
+from tests.conversations.virtual import converse, run
+from tests.shell import Tap
 
 Faults: TypeAlias = dict[str, Any]
 
@@ -59,7 +61,7 @@ class World:
     """A session while it runs."""
 
     vehicle: Vehicle
-    endpoint: Silence
+    endpoint: Tap
     session: Session
 
 
@@ -120,9 +122,9 @@ class Sessions(RuleBasedStateMachine):
         """Let the vehicle be silent for some time."""
 
         async def step(world: World) -> None:
-            world.endpoint.at = anyio.current_time()
+            world.endpoint.silent_at = anyio.current_time()
             await anyio.sleep(length)
-            world.endpoint.at = 1e9
+            world.endpoint.silent_at = math.inf
 
         self.steps.append(step)
 
@@ -147,7 +149,7 @@ class Sessions(RuleBasedStateMachine):
 
     async def _session(self) -> None:
         vehicle = MAKERS[self.kind]()
-        endpoint = Silence(Air.symmetric([vehicle], seed=self.seed, **self.faults), at=1e9)
+        endpoint = Tap(Air.symmetric([vehicle], seed=self.seed, **self.faults))
         async with converse(endpoint) as conversation:
             node = await conversation.node()
             session = node.plain

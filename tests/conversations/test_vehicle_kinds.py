@@ -18,8 +18,8 @@ from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire import messages
 from tests.conversations.partial import EVERYTHING, TABLE, Partial
-from tests.conversations.virtual import QUIET, Puppet, Tap, losing, meanwhile, talking, virtual_on_both
-from tests.shell import Eventful
+from tests.conversations.virtual import QUIET, Puppet, losing, meanwhile, talking, virtual_on_both
+from tests.shell import Eventful, Tap
 
 ARDUPILOT = messages.Heartbeat(2, 3, system_status=4)
 PX4 = messages.Heartbeat(2, 12, system_status=4)

@@ -21,7 +21,8 @@ from paramclient.protocol.writes import write, write_many
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from paramclient.wire.messages import AutopilotVersion, CommandLong, Message, ParamError, ParamSet, ParamValue
 from tests.conversations.partial import Partial
-from tests.conversations.virtual import Silence, Tap, converse, losing, meanwhile, talking, virtual_on_both
+from tests.conversations.virtual import converse, losing, meanwhile, talking, virtual_on_both
+from tests.shell import Tap
 
 Maker = type[PX4Vehicle] | type[ArduPilotVehicle]
 RULED = ("MPC", "LNDMC", "BARO", "STAT", "MIS_", "INS")
@@ -308,11 +309,11 @@ async def test_no_set_is_sent_before_the_encoding_is_certain() -> None:
 
 async def test_silence_is_no_reply_within_7_s_and_a_cancelled_write_sends_no_more() -> None:
     for maker in (PX4Vehicle, ArduPilotVehicle):
-        endpoint = Silence(maker(), at=1e9)
+        endpoint = Tap(maker())
         async with talking(endpoint) as (conversation, session):
             name = "MC_ROLL_P" if maker is PX4Vehicle else "ATC_ANG_RLL_P"
             await read(session, name)
-            endpoint.at = began = anyio.current_time()
+            endpoint.silent_at = began = anyio.current_time()
             with anyio.move_on_after(1.0):
                 await write(session, name, 1.5)
             sent = len(conversation.sent_of(ParamSet))
@@ -338,13 +339,13 @@ async def test_values_of_one_parameter_are_set_in_the_order_of_the_call() -> Non
 @virtual_on_both
 @pytest.mark.parametrize("timeout", [None, 2.0], ids=["lost", "at the timeout"])
 async def test_values_are_accepted_though_they_could_not_be_watched(timeout: float | None) -> None:
-    endpoint = Silence(Air.symmetric([PX4Vehicle()], delay=0.05), at=1e9)
+    endpoint = Tap(Air.symmetric([PX4Vehicle()], delay=0.05))
     async with talking(endpoint) as (_, session):
         if timeout is None:
-            endpoint.at = anyio.current_time() + 1.0
+            endpoint.silent_at = anyio.current_time() + 1.0
         pairs = [("MC_ROLL_P", 5.5), ("MC_PITCH_P", 5.5)]
         result = await write_many(session, pairs, settle=30.0, timeout=timeout)
-        assert timeout is not None or anyio.current_time() - endpoint.at < 7.0
+        assert timeout is not None or anyio.current_time() - endpoint.silent_at < 7.0
         assert [each.status for each in result.outcomes] == [SetStatus.ACCEPTED] * 2
         assert [each.reported for each in result.outcomes] == [5.5, 5.5]
 

@@ -21,10 +21,8 @@ from paramclient.protocol.session import Session
 from paramclient.protocol.station import Station
 from paramclient.protocol.table import Change
 from paramclient.sim import Endpoint
-from paramclient.wire.frames import Framer
-from paramclient.wire.messages import DECODED_IDS, Heartbeat, Message, decode, encode
-from tests import shell
-from tests.shell import SimulatedTimeLoop, outcome, simulated_time_loop
+from paramclient.wire.messages import Heartbeat, Message, encode
+from tests.shell import Passes, SimulatedTimeLoop, decoded, outcome, simulated_time_loop
 
 T = TypeVar("T")
 
@@ -188,63 +186,10 @@ async def meanwhile(*calls: Awaitable[Any]) -> AsyncIterator[list[Any]]:
 
 def messages_in(data: bytes) -> list[Message]:
     """Return the messages in a datagram."""
-    frames = Framer(DECODED_IDS, stream=False).receive(data)
-    return [message for frame in frames if (message := decode(frame)) is not None]
+    return [message for _, message in decoded(data)]
 
 
-class Tap(shell.Tap):
-    """An endpoint behind a filter: messages to it and from it are passed on where a function says so.
-
-    Args:
-        endpoint: the vehicle; another one may take its place.
-        up, down: return whether a message to the vehicle, or from it, arrives.
-    """
-
-    def __init__(
-        self,
-        endpoint: Endpoint,
-        *,
-        up: Callable[[Message], bool] = lambda message: True,
-        down: Callable[[Message], bool] = lambda message: True,
-    ) -> None:
-        super().__init__(endpoint)
-        self.up = up
-        self.down = down
-
-    def receive(self, data: bytes, now: float) -> None:
-        """Pass a datagram on to the vehicle."""
-        if all(map(self.up, messages_in(data))):
-            super().receive(data, now)
-
-    def data_to_send(self) -> list[bytes]:
-        """Return what arrives of the vehicle's frames."""
-        return [data for data in super().data_to_send() if all(map(self.down, messages_in(data)))]
-
-
-class Silence(Tap):
-    """An endpoint that goes silent at a time, as a vehicle that crashes.
-
-    Args:
-        endpoint: the vehicle.
-        at: seconds on the event loop's clock.
-    """
-
-    def __init__(self, endpoint: Endpoint, at: float) -> None:
-        super().__init__(endpoint)
-        self.at = at
-
-    def receive(self, data: bytes, now: float) -> None:
-        """Take a frame, unless silent."""
-        if now < self.at:
-            self.endpoint.receive(data, now)
-
-    def data_to_send(self) -> list[bytes]:
-        """Return the frames of the vehicle; none while silent."""
-        data = self.endpoint.data_to_send()
-        return data if anyio.current_time() < self.at else []
-
-
-def losing(number: int, is_lost: Callable[[Message], bool]) -> Callable[[Message], bool]:
+def losing(number: int, is_lost: Callable[[Message], bool]) -> Passes:
     """Return a filter for a `Tap`, which loses the first messages of which a function says so."""
     left = [number]
 
