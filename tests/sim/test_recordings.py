@@ -174,69 +174,75 @@ PX4: dict[str, tuple[Callable[[str], Vehicle], float]] = {
 }
 
 
-class TestReplay:
-    """The same messages, in the same order, at the same times; see `tests.recordings` for tolerances."""
+# The same messages, in the same order, at the same times; see `tests.recordings` for tolerances.
 
-    def test_every_recording_is_replayed(self) -> None:
-        alone = {name for name in NAMES if hasattr(TestReplay, f"test_{name}")}
-        assert set(NAMES) == set(ARDUPILOT) | set(PX4) | alone
 
-    @pytest.mark.parametrize("name", [*ARDUPILOT, *PX4])
-    def test_of_a_quiet_vehicle(self, name: str) -> None:
-        make, phase = (ARDUPILOT | PX4)[name]
-        recorded, sent = compared(from_vehicle(name)), compared(replay(make(name), name, phase=phase))
-        burst = 10 if name in ARDUPILOT else 20
-        assert differences(name, recorded, sent, burst=burst, unasked=UNASKED) == []
+def test_every_recording_is_replayed() -> None:
+    alone = {name for name in NAMES if f"test_{name}" in globals()}
+    assert set(NAMES) == set(ARDUPILOT) | set(PX4) | alone
 
-    def test_px4_full_download(self) -> None:
-        """The barometer, found 1.4 s into the log and sent unsolicited, is replayed as an event."""
-        name = "px4_full_download"
-        vehicle = PX4Vehicle()
-        found = [vehicle.param(each) for each in BAROMETER]
-        for param in found:
-            vehicle.set_param(param.name, -1)
-        events = [(1.4147, param.name, param.value) for param in found]
-        sent = replay(vehicle, name, phase=0.19, on_board=events)
-        assert differences(name, compared(from_vehicle(name)), compared(sent), burst=20) == []
 
-    def test_px4_get_set(self) -> None:
-        """Including the barometer's parameters, unsaved since boot, which the first set pushes as well."""
-        name = "px4_get_set"
-        vehicle = PX4Vehicle(unsaved=BAROMETER)
-        recorded = compared(from_vehicle(name))
-        assert differences(name, recorded, compared(replay(vehicle, name, phase=0.004)), burst=20) == []
-        last = param_values(recorded)[-1]
-        assert int.from_bytes(last.raw, "little") == vehicle.announced_hash() != PX4_HASH
+@pytest.mark.parametrize("name", [*ARDUPILOT, *PX4])
+def test_a_recording_of_a_quiet_vehicle_is_replayed(name: str) -> None:
+    make, phase = (ARDUPILOT | PX4)[name]
+    recorded, sent = compared(from_vehicle(name)), compared(replay(make(name), name, phase=phase))
+    burst = 10 if name in ARDUPILOT else 20
+    assert differences(name, recorded, sent, burst=burst, unasked=UNASKED) == []
 
-    def test_px4_20_sets(self) -> None:
-        """From 3.34 s on, the real vehicle pushes no set again. Pushes of sets in quick succession are
-        missing at random, so only the acknowledgements are compared there."""
-        name = "px4_20_sets"
-        recorded = without_pushes(name, compared(from_vehicle(name)), 3.34)
-        vehicle = px4_of("px4_list_beside_reads")
-        sent = without_pushes(name, compared(replay(vehicle, name, phase=0.0095)), 3.34)
-        assert differences(name, recorded, sent, burst=20, unasked=UNASKED) == []
 
-    def test_ardupilot_get_set(self) -> None:
-        """The ground pressures of two barometers are live sensor values: replayed as events with the
-        recorded values."""
-        name = "ardupilot_get_set"
-        recorded = compared(from_vehicle(name))
-        events: list[tuple[float, str, Value]] = [
-            (time - 0.005, message.param_id, struct.unpack("<f", message.raw)[0])
-            for time, message in recorded
-            if isinstance(message, messages.ParamValue)
-            and message.param_id in ("BARO1_GND_PRESS", "BARO2_GND_PRESS")
-        ]
-        assert len(events) == 2
-        sent = compared(replay(ArduPilotVehicle(live_period=0.0), name, phase=0.005, on_board=events))
-        assert differences(name, recorded, sent, burst=10) == []
+def test_px4_full_download() -> None:
+    """The barometer, found 1.4 s into the log and sent unsolicited, is replayed as an event."""
+    name = "px4_full_download"
+    vehicle = PX4Vehicle()
+    found = [vehicle.param(each) for each in BAROMETER]
+    for param in found:
+        vehicle.set_param(param.name, -1)
+    events = [(1.4147, param.name, param.value) for param in found]
+    sent = replay(vehicle, name, phase=0.19, on_board=events)
+    assert differences(name, compared(from_vehicle(name)), compared(sent), burst=20) == []
 
-    def test_ardupilot_ftp_download(self) -> None:
-        """Both files, with every block, and the end of each."""
-        name = "ardupilot_ftp_download"
-        recorded = compared(from_vehicle(name))
-        sent = compared(replay(ArduPilotVehicle(live_period=0.0), name, phase=0.003))
-        assert differences(name, recorded, sent, burst=10) == []
-        answers = [message for _, message in sent if isinstance(message, messages.FileTransfer)]
-        assert len(answers) == 2 * (2 + 64 + 1 + 1)
+
+def test_px4_get_set() -> None:
+    """Including the barometer's parameters, unsaved since boot, which the first set pushes as well."""
+    name = "px4_get_set"
+    vehicle = PX4Vehicle(unsaved=BAROMETER)
+    recorded = compared(from_vehicle(name))
+    assert differences(name, recorded, compared(replay(vehicle, name, phase=0.004)), burst=20) == []
+    last = param_values(recorded)[-1]
+    assert int.from_bytes(last.raw, "little") == vehicle.announced_hash() != PX4_HASH
+
+
+def test_px4_20_sets() -> None:
+    """From 3.34 s on, the real vehicle pushes no set again. Pushes of sets in quick succession are
+    missing at random, so only the acknowledgements are compared there."""
+    name = "px4_20_sets"
+    recorded = without_pushes(name, compared(from_vehicle(name)), 3.34)
+    vehicle = px4_of("px4_list_beside_reads")
+    sent = without_pushes(name, compared(replay(vehicle, name, phase=0.0095)), 3.34)
+    assert differences(name, recorded, sent, burst=20, unasked=UNASKED) == []
+
+
+def test_ardupilot_get_set() -> None:
+    """The ground pressures of two barometers are live sensor values: replayed as events with the
+    recorded values."""
+    name = "ardupilot_get_set"
+    recorded = compared(from_vehicle(name))
+    events: list[tuple[float, str, Value]] = [
+        (time - 0.005, message.param_id, struct.unpack("<f", message.raw)[0])
+        for time, message in recorded
+        if isinstance(message, messages.ParamValue)
+        and message.param_id in ("BARO1_GND_PRESS", "BARO2_GND_PRESS")
+    ]
+    assert len(events) == 2
+    sent = compared(replay(ArduPilotVehicle(live_period=0.0), name, phase=0.005, on_board=events))
+    assert differences(name, recorded, sent, burst=10) == []
+
+
+def test_ardupilot_ftp_download() -> None:
+    """Both files, with every block, and the end of each."""
+    name = "ardupilot_ftp_download"
+    recorded = compared(from_vehicle(name))
+    sent = compared(replay(ArduPilotVehicle(live_period=0.0), name, phase=0.003))
+    assert differences(name, recorded, sent, burst=10) == []
+    answers = [message for _, message in sent if isinstance(message, messages.FileTransfer)]
+    assert len(answers) == 2 * (2 + 64 + 1 + 1)
