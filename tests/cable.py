@@ -7,7 +7,6 @@ import select
 import tty
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 
 import anyio
 
@@ -33,9 +32,7 @@ class Cable:
         self.plug_in()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._file >= 0:
             self.pull_out()
 

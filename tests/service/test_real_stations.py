@@ -24,34 +24,39 @@ from tests.shell import TIMEOUT, Tap, small_px4, until
 from tests.simulated_on_udp import free_port
 
 
-def fetch_with_pymavlink(port: int) -> dict[str, float]:
-    """Request the list and, of what has not come after a second of silence, single values."""
+def fetch_with_pymavlink(port: int, lists: int = 1) -> tuple[dict[str, float], float]:
+    """Request lists and, of what has not come after a second of silence, single values.
+
+    Returns the values, and the share of frames that are lost by their sequence numbers, in percent.
+    """
     from pymavlink import mavutil
 
     master = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}")
     master.wait_heartbeat(timeout=TIMEOUT)
     encoding = Encoding.C_CAST if master.messages["HEARTBEAT"].autopilot == 3 else Encoding.BYTEWISE
     values: dict[str, float] = {}
-    missing: set[int] | None = None
-    master.mav.param_request_list_send(1, 1)
-    while missing is None or missing:
-        message = master.recv_match(type="PARAM_VALUE", blocking=True, timeout=1.0)
-        if message is None:
-            for index in sorted(missing or ())[:10]:
-                master.mav.param_request_read_send(1, 1, b"", index)
-        elif message.param_index < message.param_count:
-            missing = set(range(message.param_count)) if missing is None else missing
-            missing.discard(message.param_index)
-            raw = struct.pack("<f", message.param_value)
-            values[message.param_id] = float(decode_value(raw, message.param_type, encoding)[0])
-    return values
+    for _ in range(lists):
+        missing: set[int] | None = None
+        master.mav.param_request_list_send(1, 1)
+        while missing is None or missing:
+            message = master.recv_match(type="PARAM_VALUE", blocking=True, timeout=1.0)
+            if message is None:
+                for index in sorted(missing or ())[:10]:
+                    master.mav.param_request_read_send(1, 1, b"", index)
+            elif message.param_index < message.param_count:
+                missing = set(range(message.param_count)) if missing is None else missing
+                missing.discard(message.param_index)
+                raw = struct.pack("<f", message.param_value)
+                values[message.param_id] = float(decode_value(raw, message.param_type, encoding)[0])
+        master.wait_heartbeat(timeout=TIMEOUT)
+    return values, float(master.packet_loss())
 
 
-def fetch_with_mavsdk(port: int) -> dict[str, float]:
-    """Download all parameters with MAVSDK."""
+def fetch_with_mavsdk(port: int) -> tuple[dict[str, float], None]:
+    """Download all parameters with MAVSDK, which counts no losses."""
     with mavsdk_params(port) as param:
         found = param.get_all_params()
-        return {each.name: float(each.value) for each in (*found.int_params, *found.float_params)}
+        return {each.name: float(each.value) for each in (*found.int_params, *found.float_params)}, None
 
 
 @contextmanager
@@ -84,7 +89,7 @@ async def test_stations_get_every_value_and_the_radio_carries_none(kind: Callabl
     found: list[dict[str, float]] = []
 
     async def fetch(way: Any, port: int) -> None:
-        found.append(await anyio.to_process.run_sync(way, port))
+        found.append((await anyio.to_process.run_sync(way, port))[0])
 
     async with stations_of(vehicle, 2, loss=0.2, delay=0.05) as (radio, ports):
         async with anyio.create_task_group() as tasks:
@@ -97,26 +102,10 @@ async def test_stations_get_every_value_and_the_radio_carries_none(kind: Callabl
         assert {name: values[name] for name in truth} == pytest.approx(truth, rel=1e-6)
 
 
-def loss_with_pymavlink(port: int) -> float:
-    """Fetch a list, and return the share of lost frames by the sequence numbers, in percent."""
-    from pymavlink import mavutil
-
-    master = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}")
-    master.wait_heartbeat(timeout=TIMEOUT)
-    index = None
-    for _ in range(3):
-        master.mav.param_request_list_send(1, 1)
-        while index != 902:
-            index = master.recv_match(type="PARAM_VALUE", blocking=True, timeout=TIMEOUT).param_index
-        index = None
-        master.wait_heartbeat(timeout=TIMEOUT)
-    return float(master.packet_loss())
-
-
 @pytest.mark.asyncio
 async def test_pymavlink_counts_no_losses() -> None:
     async with stations_of(PX4Vehicle(), 1) as (_, [port]):
-        assert await anyio.to_process.run_sync(loss_with_pymavlink, port) == 0.0
+        assert (await anyio.to_process.run_sync(fetch_with_pymavlink, port, 3))[1] == 0.0
 
 
 MAVPROXY = shutil.which("mavproxy.py")
