@@ -130,15 +130,6 @@ def test_component_chooses_between_two_autopilots_of_a_system(
         assert (untouched(one), untouched(two)) == (True, False)
 
 
-def test_a_missing_system_is_not_replaced_by_another(command: Command, put: Put, words: Words) -> None:
-    one = px4()
-    put(Air([one, copter()]))
-    for name in WRITING:
-        done = command(*words(name), "--vehicle", 12)
-        assert (done.code, done.out) == (3, "")
-    assert untouched(one)
-
-
 # Vehicles that appear and disappear
 
 
@@ -191,9 +182,6 @@ def test_values_of_an_ambiguous_source_are_not_used(
     done = command("apply", URL, SOURCE, "--yes", *dry)
     assert (done.code, done.out, done.err) == (2, "", LISTED)
     assert untouched(target, one, two)
-
-
-# All vehicles
 
 
 # time

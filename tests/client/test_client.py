@@ -72,15 +72,6 @@ async def test_an_exception_of_the_body_is_raised_unchanged(error: BaseException
     assert not shell.tasks_beside()
 
 
-async def test_a_time_limit_around_the_client_ends_it() -> None:
-    with anyio.move_on_after(0.5) as scope:
-        async with shell.a_client(shell.generic()) as client:
-            await client.component(system=99)
-    assert scope.cancelled_caught
-    await asyncio.sleep(1.0)
-    assert not shell.tasks_beside()
-
-
 async def test_calls_on_a_client_that_is_not_open() -> None:
     client = shell.a_client(shell.small_px4())
     for before in (client.component(), client.only_component(), client.fetch_all()):

@@ -42,7 +42,6 @@ BY_PATH = "serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0-port0:115200"
             "sim:px4?jitter=-0&queue=0&system=255&reorder=.5",
             "sim:px4?jitter=0.0&queue=0&reorder=0.5&system=255",
         ),
-        ("sim:px4?seed=1&loss=.05&delay=0.05", "sim:px4?delay=0.05&loss=0.05&seed=1"),
         ("sim:px4?rate=1e3&bit_errors=.00001", "sim:px4?bit_errors=1e-05&rate=1000.0"),
     ],
 )

@@ -227,7 +227,6 @@ REFUSED: list[tuple[str, str, dict[str, Any]]] = [
     ("POST", "apply", {"values": {}}),
     ("POST", "plan", {"values": {"A_NAME_THAT_IS_LONG": 1}}),
     ("POST", "restore", {"at": True}),
-    ("POST", "restore", {"at": "2026-11-20T14:00"}),
     ("POST", "snapshots", {"reason": ""}),
     ("POST", "fetch", {"refresh": "maybe", "x": 1}),
 ]
