@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from paramclient.files import FileFormat, loads
-from paramclient.sim import ArduPilotVehicle, PX4Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire.messages import ParamSet
 from tests.commands import behind, in_process, leaping
 from tests.service.hub import V, browsing, problem, service, until
@@ -55,6 +55,17 @@ async def test_a_file_with_a_name_that_no_vehicle_can_have_is_shown_and_not_appl
         assert vehicle.requests["PARAM_SET"] == 0
 
 
+async def test_a_file_of_several_vehicles_gives_the_set_of_these_ids_and_no_other() -> None:
+    rows = [(2, 1, 22), (1, 5, 55), (1, 1, 11)]
+    text = "".join(f"{system}\t{component}\tPARAM_04\t{value}\t6\n" for system, component, value in rows)
+    file = {"name": "a.params", "text": text}
+    async with browsing(generic()) as browser:
+        plan = (await browser.post(f"{V}/plan", json={"file": file})).json()
+        assert plan["params"]["PARAM_04"]["wanted"] == 11
+        chosen = await browser.post(f"{V}/plan", json={"file": file | {"component": 5}})
+        problem(chosen, 422, "usage-error")
+
+
 async def test_an_apply_is_limited_to_names_and_refuses_values_out_of_range(cache: str) -> None:
     vehicle = PX4Vehicle(metadata=True)
     async with browsing(vehicle, cache=cache) as browser:
@@ -69,6 +80,8 @@ async def test_an_apply_is_limited_to_names_and_refuses_values_out_of_range(cach
             body["values"]["MC_ROLL_P"] = value
             done = (await browser.post(f"{V}/apply", json={**body, **forced})).json()
             assert done["params"]["MC_ROLL_P"]["status"] == "accepted"
+        for at, status in (("", 200), ("&at=2", 422)):  # perhaps of another firmware
+            assert (await browser.get(f"{V}/file?changed=true{at}")).status_code == status
 
 
 async def test_a_restore_goes_back_to_before_the_last_apply_once(cache: str) -> None:
@@ -97,6 +110,16 @@ async def test_snapshots_are_stored_listed_read_and_applied(cache: str) -> None:
         assert [name for name, each in plan["params"].items() if each["status"] == "set"] == ["PARAM_04"]
         assert "PARAM_04\t4\t" in (await browser.get(f"{V}/file", params=query)).text
         problem(await browser.get(f"{V}/params?at=99"), 404, "not-in-cache")
+    distant = Air.symmetric([small_px4()], delay=1.0)  # its identity comes behind the first heartbeat
+    async with service(distant, cache=cache, fetches=False) as (_, browser):
+        await until(browser, "/api/vehicles", lambda found: bool(found["vehicles"]))
+        assert (await browser.get(f"{V}/snapshots")).json()["snapshots"] == [kept]
+
+
+async def test_there_is_no_snapshot_of_no_parameters(cache: str) -> None:
+    async with service(generic(), cache=cache, fetches=False) as (_, browser):
+        await until(browser, V, lambda found: found["state"] == "new")
+        problem(await browser.post(f"{V}/snapshots", json={"reason": "none"}), 422, "usage-error")
 
 
 async def test_history_has_changes_of_all_or_of_one_name(cache: str) -> None:
@@ -125,9 +148,11 @@ async def test_without_a_cache_the_past_is_a_problem() -> None:
 async def test_a_vehicle_is_set_up_by_one_at_a_time(cache: str) -> None:
     async with browsing(generic(), cache=cache) as browser:
         bodies = [{"values": {"PARAM_04": number}} for number in (8, 9)]
-        answers = await asyncio.gather(*(browser.post(f"{V}/apply", json=body) for body in bodies))
-        assert sorted(answer.status_code for answer in answers) == [200, 409]
-        problem(next(answer for answer in answers if answer.status_code == 409), 409, "busy")
+        posts = [browser.post(f"{V}/apply", json=body) for body in bodies]
+        done, *others = await asyncio.gather(*posts, browser.post(f"{V}/restore", json={}))
+        assert done.status_code == 200
+        for each in others:
+            problem(each, 409, "busy")
         assert (await browser.post(f"{V}/apply", json=bodies[0])).status_code == 200
 
 

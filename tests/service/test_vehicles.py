@@ -10,10 +10,12 @@ from typing import Any
 from unittest import mock
 
 import httpx
+import pytest
 
 from paramclient.links import SimLink
 from paramclient.model.values import ParamType
 from paramclient.sim import ArduPilotVehicle, Camera, PX4Vehicle
+from paramclient.sim.px4 import METADATA_FILE
 from tests.recordings import DATA
 from tests.service.hub import V, browsing, problem, service, synced, until, value
 from tests.service.test_events import events
@@ -50,7 +52,7 @@ async def test_a_link_that_fails_for_good_is_opened_with_a_fresh_client() -> Non
         assert (await stream.next("vehicle"))["vehicle"] is None
 
 
-async def test_an_unexpected_error_ends_no_other_link() -> None:
+async def test_an_unexpected_error_ends_no_other_link(caplog: pytest.LogCaptureFixture) -> None:
     links = [SimLink(generic(), "sim:a"), SimLink(small_px4(system=3), "sim:b")]
     async with service(*links) as (_, browser):
         await synced(browser)
@@ -58,14 +60,42 @@ async def test_an_unexpected_error_ends_no_other_link() -> None:
             await asyncio.sleep(2)
         await synced(browser)
         assert [each["error"] for each in (await browser.get("/health")).json()["links"]] == [None, None]
+        assert "an error of the program" in caplog.text
 
 
-async def test_a_log_is_followed_to_its_end_and_stays() -> None:
-    async with service(f"replay:{DATA / 'px4_full_download.tlog'}?speed=0") as (_, browser):
+async def test_a_log_is_followed_to_its_end_and_stays(tmp_path: Path) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    async with service(f"replay:{DATA / 'px4_full_download.tlog'}?speed=0", cache=cache) as (_, browser):
         await asyncio.sleep(20)
         (reported,) = (await browser.get("/health")).json()["links"]
         assert (reported["state"], reported["error"]) == ("ended", None)
         assert len((await browser.get(f"{V}/params")).json()["params"]) > 900
+    assert not cache.exists()  # nor is it cached
+
+
+async def test_another_vehicle_at_an_address_has_not_the_metadata_of_the_first_one(tmp_path: Path) -> None:
+    link = PeersLink({"first": PX4Vehicle(metadata=True)})
+    async with browsing(link, cache=str(tmp_path / "cache.sqlite3")) as browser:
+        await browser.post(f"{V}/fetch", json={"metadata": True})
+        assert (await synced(browser))["has_metadata"]
+        link.endpoints = {"second": generic()}
+        await until(browser, V, lambda found: found["count"] == len(VALUES))
+        assert not (await synced(browser))["has_metadata"]
+
+
+async def test_a_download_that_fails_is_a_problem_of_the_vehicle() -> None:
+    async with browsing(vehicle := small_px4(metadata=True)) as browser:
+        del vehicle.files[METADATA_FILE]
+        problem(await browser.post(f"{V}/fetch", json={"metadata": True}), 502, "file-transfer-error")
+
+
+async def test_a_table_is_fetched_once_and_a_check_that_has_found_a_change_counts_as_a_fetch() -> None:
+    """A page loads the table again then."""
+    async with browsing(vehicle := small_px4()) as browser:
+        for fetches in (1, 2):
+            await asyncio.sleep(100)
+            assert (await synced(browser))["fetches"] == fetches
+            vehicle.load({"PARAM_01": 77})  # announces nothing
 
 
 async def test_ids_on_two_links_need_the_name_of_the_link_and_the_lowest_come_first() -> None:
@@ -138,7 +168,8 @@ async def test_fetches_at_one_time_share_a_download_and_tell_their_progress() ->
         assert len({answer.json()["elapsed_s"] for answer in results}) == 1
         assert (await browser.post(f"{V}/fetch", json={})).json()["source"] == "cache"
         assert (await browser.post(f"{V}/fetch", json={"refresh": True})).json()["source"] != "cache"
-        assert (await browser.get("/api/vehicles")).json()["vehicles"][0]["fetches"] >= 3
+        [found] = (await browser.get("/api/vehicles")).json()["vehicles"]
+        assert (found["fetches"] >= 3, found["fetch"]) == (True, None)
 
 
 async def test_a_vehicle_that_is_lost_answers_no_request_with_a_problem() -> None:
@@ -162,13 +193,14 @@ async def test_two_vehicles_under_one_address_are_not_written() -> None:
         assert px4.param("MC_ROLL_P").value != 5
 
 
-async def test_an_unexpected_error_is_a_problem_without_details() -> None:
+async def test_an_unexpected_error_is_a_problem_without_details(caplog: pytest.LogCaptureFixture) -> None:
     async with service(generic()) as (hub, browser):
         await synced(browser)
         with mock.patch.object(type(hub), "target", side_effect=RuntimeError("secret")):
             answer = await browser.get(f"{V}/params")
         problem(answer, 500, "internal")
         assert not {"Traceback", "RuntimeError", "secret"} & set(answer.text.replace('"', " ").split())
+        assert "secret" in caplog.text
 
 
 async def test_metrics_and_openapi_are_complete() -> None:
