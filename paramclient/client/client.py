@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -157,6 +158,7 @@ class ParamClient:
         self.watch_interval = watch_interval
         self._components: dict[Address, Component] = {}
         self._events: Subscribers[Event] = Subscribers()
+        self._probe_at: defaultdict[object, float] = defaultdict(float)  # of components that were not heard
         capture = None if tlog is None else Capture(tlog)
         self._traffic = Traffic() if traffic else None
         self.core = core = ClientCore(
@@ -543,15 +545,15 @@ class ParamClient:
         station = self.core.station
         system, component = asked
         check_ids(system, component)
-        probe_at = 0.0 if system and component else math.inf
         found = choose()
         with anyio.move_on_after(seconds_of(timeout)):
             while not (isinstance(found, Node) or self.core.is_over):
-                now = anyio.current_time()
-                probe_at = max(probe_at, station.listening_since + HEARTBEAT_WAIT)
-                if system and component and now >= probe_at:
-                    station.probe(system, component)
-                    probe_at = now + PROBE_INTERVAL
+                now, probe_at = anyio.current_time(), math.inf
+                if system and component:  # other callers may await it too
+                    probe_at = max(self._probe_at[asked], station.listening_since + HEARTBEAT_WAIT)
+                    if now >= probe_at:
+                        station.probe(system, component)
+                        probe_at = self._probe_at[asked] = now + PROBE_INTERVAL
                 with anyio.move_on_after(min(probe_at, math.inf if found is None else found) - now):
                     await self.core.link_task.wait_for_activity()
                 found = choose()

@@ -399,7 +399,8 @@ async def test_a_component_without_heartbeat_is_found_by_both_ids(
     bridge = Partial(serves=serves, first=first, heartbeat=None, component=240)
     air = Air.symmetric([GenericVehicle({"A": 1}), bridge], delay=delay)
     async with ParamClient(air, cache=False) as client:
-        component = await client.component(1, 240)
+        async with meanwhile(*(client.component(1, 240) for _ in range(8))):
+            component = await client.component(1, 240)
         assert (await component.get("MODE")).value == 5
         assert client.autopilots == [client.components[1, 1]]
         with pytest.raises(errors.NoReply):
