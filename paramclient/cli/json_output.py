@@ -194,15 +194,17 @@ def fetch_json(
     }
 
 
-def outcome_json(outcome: SetOutcome, kind: ParamType | int, info: ParamInfo | None) -> JsonObject:
+def outcome_json(outcome: SetOutcome, vehicle: Component, metadata: Metadata | None) -> JsonObject:
     """Return the outcome of a write.
 
     Args:
         outcome: the outcome.
-        kind: the vehicle's type of the parameter.
-        info: its metadata, or None.
+        vehicle: which was written to.
+        metadata: of its parameters, or None.
     """
     requested, actual, error = outcome.requested, outcome.reported, outcome.error
+    known, info = vehicle.params.get(outcome.name), info_of(metadata, outcome.name)
+    kind = ParamType.REAL64 if known is None else known.type
     return {
         "name": outcome.name,
         "requested": value_json(requested, kind if isinstance(requested, bytes) else ParamType.REAL64),

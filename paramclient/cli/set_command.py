@@ -216,12 +216,9 @@ class SetJob:
 
     def as_json(self) -> JsonObject:
         """Return the JSON of the vehicle and the outcomes."""
-        results = []
-        for each in self.outcomes.values():
-            known = self.session.component.params.get(each.name)
-            kind = ParamType.REAL32 if known is None else known.type
-            results.append(outcome_json(each, kind, info_of(self.described, each.name)))
-        return {"vehicle": vehicle_json(self.session.component), "results": results}
+        component = self.session.component
+        results = [outcome_json(each, component, self.described) for each in self.outcomes.values()]
+        return {"vehicle": vehicle_json(component), "results": results}
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the rows; the reported value with its meaning, if that is known."""

@@ -21,22 +21,20 @@ import anyio.to_thread
 from fastapi.sse import ServerSentEvent
 
 from paramclient.cache import ParamCache
-from paramclient.cli.json_output import JsonObject, outcome_json, table_param_json, taken, vehicle_json
+from paramclient.cli.json_output import JsonObject, info_of, table_param_json, taken, vehicle_json
 from paramclient.client.cache_writer import choose_cache
 from paramclient.client.client import Event, ParamClient
 from paramclient.client.component import Component
 from paramclient.errors import ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of
-from paramclient.metadata.info import number_of
 from paramclient.model.identity import Identity
 from paramclient.model.notation import Scalar, hash_text, rounded
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import Param, ParamType, Value, parse_ext_value
+from paramclient.model.values import Param, Value, parse_ext_value
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult, Progress
 from paramclient.protocol.identity import expects_extended
-from paramclient.protocol.set_results import SetOutcome
 from paramclient.protocol.watch import SyncState
 from paramclient.provision.inspection import wait_for_identity
 from paramclient.service.gateway import Gateway
@@ -264,18 +262,9 @@ class Target:
 
     # values
 
-    def info(self, name: str) -> ParamInfo | None:
-        """Return the metadata of a parameter, or None."""
-        return None if self.metadata is None else self.metadata.find(name)
-
     def shown(self, param: Param, *, whole: bool = False) -> JsonObject:
         """Return a parameter of the table as JSON; with `whole`, with all its metadata."""
-        return table_param_json(param, self.info(param.name), whole=whole)
-
-    def outcome(self, found: SetOutcome) -> JsonObject:
-        """Return the outcome of a write as JSON."""
-        known = self.component.params.get(found.name)
-        return outcome_json(found, ParamType.REAL64 if known is None else known.type, self.info(found.name))
+        return table_param_json(param, info_of(self.metadata, param.name), whole=whole)
 
     async def values(self, given: Mapping[str, Scalar], *, force: bool = True) -> dict[str, Value]:
         """Return the values of a request; with `force`, they may be outside the range in the metadata.
@@ -290,17 +279,13 @@ class Target:
         found: dict[str, Value] = {}
         faults: dict[str, str] = {}
         for name, each in given.items():
-            info = self.info(name)
-            value: Value | None = each
+            info = info_of(self.metadata, name) or ParamInfo(name)
             if isinstance(each, str) and self.component.is_extended:
                 known = self.component.params.get(name) or await self.component.get(name)
-                value = parse_ext_value(name, each, known.type)
-            elif isinstance(each, str):
-                value = number_of(each) if info is None else info.parse(each)
-            if value is None:
-                raise UsageError(f"{name}: {each!r} is not a number, and no metadata names its values")
-            found[name] = value
-            if info is not None and not force and (fault := info.problem(value)):
+                found[name] = parse_ext_value(name, each, known.type)
+            else:
+                found[name] = info.parse(each) if isinstance(each, str) else each
+            if not force and (fault := info.problem(found[name])):
                 faults[name] = fault
         if faults:
             detail = f"{'; '.join(list(faults.values())[:5])}. Nothing was written; `force` writes it anyway."

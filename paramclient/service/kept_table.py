@@ -438,6 +438,7 @@ class KeptTable(Stream[Change]):
                 known = table.names.get(min(table.names, default=-1), key[0]) if self.is_loading else None
                 with anyio.move_on_after(SET_TIMEOUT) as scope:
                     async with first.station.writing, task_group() as tasks:
+                        tasks.start_soon(self._wait_longer, key, scope)
                         if known is not None:
                             tasks.start_soon(read_again, self.session, known, began)
                         code = await self._write(key, f"station {first.system}/{first.component}")
@@ -455,6 +456,14 @@ class KeptTable(Stream[Change]):
             self.session.table.doubt(name)  # it may have the new value
             self.changes += 1
             self.component.core.spawn(read_again, self.session, name, anyio.current_time())
+
+    async def _wait_longer(self, key: SetKey, scope: anyio.CancelScope) -> None:
+        """Pass it on that a component works on a set of an extended parameter, and wait for its end then."""
+        with self.session.channel.inbox((messages.ParamExtAck, key[0])) as inbox:
+            while isinstance(message := await inbox.next(), messages.ParamExtAck):
+                if message.param_result == ExtAckResult.IN_PROGRESS:
+                    scope.deadline = math.inf
+                    self._say(self._sets[key], message)
 
     async def _write(self, key: SetKey, author: str) -> ParamErrorCode:
         """Write a value, and acknowledge it to the askers.

@@ -327,7 +327,8 @@ async def set_param(author: Author, target: TargetArgument, name: str, body: Wri
     """Write one parameter, and verify the value that the vehicle reports."""
     values = await target.values({name: body.value}, force=body.force)
     done = await target.component.set(name, values[name], **body.model_dump(exclude={"value"}), author=author)
-    return target.outcome(SetOutcome(name, values[name], SetStatus(done.status), done))
+    outcome = SetOutcome(name, values[name], SetStatus(done.status), done)
+    return json_output.outcome_json(outcome, target.component, target.metadata)
 
 
 @writing.patch(f"{VEHICLE}/params")
@@ -339,10 +340,11 @@ async def set_params(author: Author, target: TargetArgument, body: WriteManyRequ
     """
     values = await target.values(body.values, force=body.force)
     result = await target.component.set_many(values, **body.model_dump(exclude={"values"}), author=author)
-    results = [target.outcome(each) for each in result.outcomes]
+    component, metadata = target.component, target.metadata
+    results = [json_output.outcome_json(each, component, metadata) for each in result.outcomes]
     error = {} if result.error is None else {"error": str(result.error)}
-    ids = {"system": target.component.system, "component": target.component.component}
-    return {**ids, "vehicle": json_output.vehicle_json(target.component), "results": results, **error}
+    ids = {"system": component.system, "component": component.component}
+    return {**ids, "vehicle": json_output.vehicle_json(component), "results": results, **error}
 
 
 @reading.post(f"{VEHICLE}/fetch")

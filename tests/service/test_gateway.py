@@ -262,7 +262,7 @@ async def test_rule_2_a_name_that_the_vehicle_has_by_now_is_not_unknown() -> Non
 
 
 async def test_rule_2_extended_parameters() -> None:
-    camera = Tap(Camera())
+    camera = Tap(Camera(slow={"CAM_NAME": 10.0}))
     wanted = answers_of(Camera(), messages.ParamExtValue, messages.ParamExtRequestList(1, 100))
     async with gateway_over(camera) as served:
         station, other, one = await served.heard(), await served.heard(system=9), wanted[2]
@@ -279,9 +279,10 @@ async def test_rule_2_extended_parameters() -> None:
         assert station.of(messages.ParamExtValue) == [one, one]
         assert not camera.messages(messages.ParamExtRequestList)
         new = messages.ParamExtSet(1, 100, "CAM_NAME", b"Rear".ljust(128, b"\0"), ParamType.CUSTOM)
-        await station.ask(new, new, seconds=3.0)
-        [acknowledged] = station.of(messages.ParamExtAck)
+        await station.ask(new, new, seconds=12.0)
+        working, acknowledged = station.of(messages.ParamExtAck)
         assert acknowledged == messages.ParamExtAck("CAM_NAME", new.raw, ParamType.CUSTOM, 0)
+        assert working.param_result == 3  # PARAM_ACK_IN_PROGRESS
         await station.ask(messages.ParamExtSet(1, 100, "CAM_NAME", bytes(128), ParamType.UINT8))
         assert station.of(messages.ParamExtAck) == [replace(acknowledged, param_result=1)]
         await station.ask(messages.ParamExtRequestRead(1, 100, "NONE", -1), seconds=4.0)
