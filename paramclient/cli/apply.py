@@ -276,6 +276,8 @@ async def _run(url: str, flags: ApplyFlags, load: Load, metadata: MetadataChoice
             hint = "--no-cache does without, and restore then needs a backup file"
             raise errors.CacheError(f"nothing was sent: {failure}; {hint}") from failure
     async with sessions(url, flags, writes=True) as found:
+        if not flags.dry_run:  # which a log serves too
+            found[0].client.core.station.check_may_send()
         jobs, backups, systems = dict[CommandSession, _Job](), set[str | None](), set[object]()
 
         async def prepare(session: CommandSession) -> None:

@@ -295,7 +295,6 @@ def plan_json(plan: Plan, component: Component) -> JsonObject:
     ]
     return {
         **taken(component, "system", "component"),
-        "dry_run": True,
         "counts": plan.counts,
         "stages": stages,
         "params": rows_json(row for row in plan.rows.values() if row.status != "unchanged"),
