@@ -76,7 +76,7 @@ async def show(
         return ExitCode.DONE
     for (shown, known, defaults), item in zip(views, items, strict=True):
         columns = ("name", "value", "default", "type", "meaning", "units", "comment")
-        vehicle = address(shown) if len(items) > 1 else None
+        vehicle = address(shown) if len(items) > 1 or found is None else None
         rows = ([vehicle, *cells] for cells in cells_of(item["params"], *columns[1:]))
         output.print_table(["vehicle", *columns], rows)
         for name in shown if chosen and known is not None else ():
