@@ -129,13 +129,12 @@ class CacheWriter:
                     await self.write_all()  # after a replaced file
                     is_written = True
                     break
-        lost = () if is_written or was_told else self._identities.items()
-        for node, identity in lost:
-            if any(self._record(node, session).is_unwritten for session in node.sessions):
-                logger.warning(
-                    "the last values of %d/%d (%s) are not in the cache, and lost: %s",
-                    *(node.system, node.component, identity.key, self.failure or "timeout"),
-                )
+        known = () if is_written or was_told else self._identities
+        lost = [each for each in known if any(self._record(each, one).is_unwritten for one in each.sessions)]
+        if lost:
+            words = [f"{each.system}/{each.component} ({self._identities[each].key})" for each in lost]
+            what, why = ", ".join(words), self.failure or "timeout"
+            logger.warning("the last values of %s are not in the cache, and lost: %s", what, why)
         if self._owned:
             with anyio.move_on_after(CLOSE_WAIT_MAX, shield=True):
                 await self.run_in_thread(self.cache.close)

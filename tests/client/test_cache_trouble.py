@@ -20,7 +20,7 @@ from paramclient import CacheError, NotDurable, ParamCache, ParamClient, Trust, 
 from paramclient.cache import database
 from paramclient.client import cache_writer
 from paramclient.provision import apply
-from paramclient.sim import PX4Vehicle
+from paramclient.sim import Air, PX4Vehicle
 from tests.caches import PX4, full_disk, rubbish, set_aside, stored, update
 from tests.client.conftest import connected, fetched, table_in
 from tests.shell import Tap, bits, simulated_time_loop, small_px4
@@ -136,17 +136,18 @@ async def test_an_end_says_what_is_lost_unless_an_error_said_why(
     unwritable: Holding, is_told: bool, path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with ExitStack() as held:
-        async with fetched(small_px4(), cache=path) as (_, component):
+        async with fetched(Air([small_px4(), small_px4(system=2)]), cache=path) as (client, component):
             await anyio.sleep(2.0)
-            key = component.identity.key
+            names = [f"{each.system}/1 ({each.identity.key})" for each in client.autopilots]
             held.enter_context(unwritable(path))
-            await component.set(NAME, 5.0)
+            for each in client.autopilots:
+                await each.set(NAME, 5.0)
             if is_told:
                 await anyio.sleep(1.0)  # a write fails meanwhile
                 with pytest.raises(CacheError, match="nothing was sent"):
                     await apply(component, {NAME: 6.0})
         lost = [each.partition(", and lost: ")[0] for each in warnings(caplog)]
-    assert lost == [f"the last values of 1/1 ({key}) are not in the cache"] * (not is_told)
+    assert lost == [f"the last values of {', '.join(names)} are not in the cache"] * (not is_told)
 
 
 async def test_a_client_that_ends_waits_for_the_cache(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
