@@ -29,7 +29,7 @@ from paramclient.protocol import selection
 from paramclient.protocol.addresses import Address
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.fetch import FetchResult, Policy
-from paramclient.protocol.identity import HEARTBEAT_WAIT
+from paramclient.protocol.identity import HEARTBEAT_WAIT, expects_extended
 from paramclient.protocol.node import Node
 from paramclient.protocol.station import Station
 from paramclient.protocol.watch import INTERVAL_MIN
@@ -453,8 +453,10 @@ class ParamClient:
             await anyio.sleep_until(began + SILENT_TIME)
             if any(each.node.channel.answered.is_set() for each in chosen.values()):
                 for address, each in chosen.items():
-                    has_parameters = each in self.autopilots and each.autopilot in ("ardupilot", "px4")
-                    if each.count is None and not (has_parameters or each.node.channel.answered.is_set()):
+                    is_likely = each in self.autopilots and each.autopilot in ("ardupilot", "px4")
+                    is_other = expects_extended(each.identity.vehicle_type, each.component)
+                    is_likely |= each.node.channel.answered.is_set() and not is_other
+                    if each.count is None and not is_likely:
                         scopes[address].cancel()
 
         async with task_group() as tasks:

@@ -33,6 +33,7 @@ from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
 from paramclient.wire import messages
 from tests import shell
 from tests.client.conftest import connected, fetched
+from tests.conversations.partial import Partial
 from tests.conversations.virtual import meanwhile, virtual_on_both
 from tests.simulated_on_udp import flying
 
@@ -267,14 +268,15 @@ def silent(**options: Any) -> shell.Tap:
 @pytest.mark.parametrize("autopilot", [messages.MAV_AUTOPILOT_GENERIC, messages.MAV_AUTOPILOT_INVALID])
 async def test_a_silent_component_delays_no_other_component(autopilot: int) -> None:
     parts = [silent(**at, autopilot=autopilot) for at in ({"component": 100}, {"system": 2})]
-    async with shell.a_client(Air([*parts, shell.generic()])) as client:
+    camera = Partial(serves=("commands",), component=101, heartbeat=messages.Heartbeat(30, 8))
+    async with shell.a_client(Air([*parts, camera, shell.generic()])) as client:
         component = await client.component(system=1, component=1)
         with anyio.fail_after(0.5):
             assert (await component.fetch_all()).complete
         with anyio.fail_after(3.0):
             everything = await client.fetch_all(refresh=True)
         assert everything.results.keys() == {(1, 1)}
-        assert everything.silent.keys() == {(1, 100), (2, 1)}
+        assert everything.silent.keys() == {(1, 100), (1, 101), (2, 1)}
         for error in everything.silent.values():
             assert isinstance(error, errors.NoReply)
             assert "sends messages" in str(error)
