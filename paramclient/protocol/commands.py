@@ -63,12 +63,10 @@ async def request_message(channel: Channel, kind: type[M]) -> M | None:
         if isinstance(message, kind):
             return message
         assert isinstance(message, messages.CommandAck)
-        is_refusal = message.result not in (CommandResult.ACCEPTED, CommandResult.IN_PROGRESS)
-        return False if is_refusal else None
+        return None if message.result in (CommandResult.ACCEPTED, CommandResult.IN_PROGRESS) else False
 
-    what = f"message {number:.0f} of {channel}"
     with channel.inbox(kind, (messages.CommandAck, messages.MAV_CMD_REQUEST_MESSAGE)) as inbox:
-        answer = await channel.exchange(request, inbox, accept, what=what)
+        answer = await channel.exchange(request, inbox, accept, what=f"message {number:.0f} of {channel}")
     return answer if isinstance(answer, kind) else None
 
 

@@ -74,8 +74,7 @@ class Dialect:
 
 def _plain_param(name: str, raw: bytes, number: int, index: int | None, encoding: Encoding) -> Param:
     bits, is_raw = bits_of_wire(raw, number, encoding)
-    value = from_bits(bits, number, is_raw=is_raw)
-    return Param(name, value, number, index, bits, is_raw=is_raw)
+    return Param(name, from_bits(bits, number, is_raw=is_raw), number, index, bits, is_raw=is_raw)
 
 
 PLAIN = Dialect(

@@ -315,7 +315,6 @@ def result_of(
     if policy is Policy.AUTO:
         indices = (table.params[name].index for name in cached)
         missing |= {index for index in indices if index is not None}
-    is_confirmed = table.is_complete and (source == "cache" or not missing)
     return FetchResult(
         channel.system,
         channel.component,
@@ -323,7 +322,7 @@ def result_of(
         source,
         table.count or len(table.params) + len(missing),  # none where it cannot be one
         tuple(sorted(missing)),
-        table.hash if is_confirmed else None,
+        table.hash if table.is_complete and (source == "cache" or not missing) else None,
         anyio.current_time() - began,
         tuple(dict.fromkeys(notes)),
         listed.lost,

@@ -397,8 +397,7 @@ class _FileReader:
                 return
             if channel.is_silent(self._began):
                 what = f"{self._path} of {channel} at byte {offset}"
-                waited = anyio.current_time() - self._began
-                raise NoReply(what, attempts=attempt + 1, waited=waited)
+                raise NoReply(what, attempts=attempt + 1, waited=anyio.current_time() - self._began)
 
     async def _take_burst(self, inbox: Inbox, pause: float) -> bool:
         """Take the blocks of a burst until it is over; return False at a pause."""

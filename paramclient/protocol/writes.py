@@ -29,6 +29,7 @@ from paramclient.model.identity import autopilot_name, reason_against_non_finite
 from paramclient.model.names import is_group_switch
 from paramclient.model.values import Param, ParamType, Trust, Value, format_value
 from paramclient.protocol.channel import Inbox, task_group
+from paramclient.protocol.list_download import download_list
 from paramclient.protocol.reads import queue_time, read, read_param, refusal
 from paramclient.protocol.session import Session
 from paramclient.protocol.set_results import SetManyResult, SetOutcome, SetResult, SetStatus
@@ -451,8 +452,9 @@ async def _read_writable(session: Session, name: str) -> Param:
     param = await _known(session, name)
     is_integer = isinstance(param.type, ParamType) and param.type.is_integer
     if is_integer and session.identification.chosen is None:
-        # 0 is the same in both, and files have no encoding; a list alone has shown all that there is.
-        if not session.table.evidence and session.serves_reads.get(int) is not False:
+        # 0 is the same in both, and files have no encoding; a whole list has shown all that there is.
+        is_all = session.table.is_complete and session.serves_reads.get(int) is False
+        if not (session.table.evidence or is_all):
             await session.seeking.join(lambda: _seek_evidence(session))
         if doubt := session.encoding_doubt:
             raise UsageError(f"{name} was not written. {doubt}")
@@ -466,8 +468,14 @@ async def _known(session: Session, name: str) -> Param:
 
 
 async def _seek_evidence(session: Session) -> None:
-    """Read the first values of the list, until one shows the encoding or all had time to be answered."""
+    """Read the first values of the list, until one shows the encoding or all had time to be answered.
+
+    Where no reads by index are answered, the whole list may show it.
+    """
     channel, table = session.channel, session.table
+    if session.serves_reads.get(int) is False:
+        await session.listing.join(lambda: download_list(session))
+        return
     with channel.inbox(session.dialect.value) as inbox:
         for first in range(0, min(EVIDENCE_MAX, table.count or EVIDENCE_MAX), EVIDENCE_READS):
             sent, seconds = anyio.current_time(), queue_time(session, EVIDENCE_READS)

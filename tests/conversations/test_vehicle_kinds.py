@@ -365,6 +365,14 @@ async def test_integers_in_another_encoding_are_told_and_not_written(
         assert not session.encoding_doubt
 
 
+async def test_a_list_in_progress_may_still_show_another_encoding() -> None:
+    table, serves = {"ZERO": (0.0, ParamType.INT32), **TABLE}, ("list", "sets", "acks")
+    vehicle = Partial(table, serves=serves, heartbeat=QUIET, encoding=Encoding.C_CAST)
+    async with talking(Air.symmetric([vehicle], rate=1_000.0)) as (_, session):
+        with pytest.raises(errors.UsageError, match=r"was not written.*--encoding c-cast"):
+            await write(session, "ZERO", 9)
+
+
 async def test_right_encodings_are_not_doubted() -> None:
     for heartbeat, encoding in ((ARDUPILOT, Encoding.C_CAST), (QUIET, Encoding.BYTEWISE)):
         large = 2**24 if encoding is Encoding.C_CAST else 2**31 - 1
