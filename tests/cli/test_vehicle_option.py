@@ -64,7 +64,7 @@ def test_a_read_says_which_vehicle_it_shows(command: Command, put: Put) -> None:
     """
     url = put(Air([px4(), copter()]))
     several = command("fetch", url)
-    assert several.rows[0][0] == command("show", url, "A").rows[0][0] == "vehicle"
+    assert several.rows[0][0] == command("show", "sim:px4", "MC_ROLL_P").rows[0][0] == "vehicle"
     assert re.search(
         r"[14]/1 \w+ was used, the first vehicle heard\. Also on this link: [14]/1 \w+ quadrotor\. "
         r"--vehicle chooses one\n",
