@@ -227,7 +227,7 @@ class _Fetch:
             ):
                 break
             digest = None  # it was of the table before
-        if answer.is_other:
+        if answer.is_other or (answer.reason and self.session.serves_checksum):
             self._name_changes()
         return self._result(source)
 

@@ -301,7 +301,7 @@ class Session:
         def attempts() -> int:
             is_late = anyio.current_time() - began + timing.timeout(0) > FTP_SILENT_TIME
             is_vain = is_late or not self.identification.may_serve_file  # the version may just have arrived
-            return 0 if is_vain else timing.attempts_for(SILENT_LOST)
+            return 0 if is_vain and not self.serves_checksum else timing.attempts_for(SILENT_LOST)
 
         return attempts
 
