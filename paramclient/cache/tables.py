@@ -188,15 +188,16 @@ NAMES_SELECTED_MAX: Final = 200
 """Names above which an update reads the whole table: SQLite allows at least 999 values in a statement."""
 
 _UPSERT: Final = """
-    INSERT INTO parameter
-        (owner, name, type, value, param_index, volatile, heard_at, default_value)
+    INSERT INTO parameter (owner, name, type, value, param_index, volatile, heard_at, default_value)
     VALUES (?, ?, ?, ?, ?, ?, ?, ?)
     ON CONFLICT (owner, name) DO UPDATE SET
         (type, value, param_index, volatile, heard_at, default_value) =
         (excluded.type, excluded.value, excluded.param_index, excluded.volatile, excluded.heard_at,
-         excluded.default_value)
+         coalesce(excluded.default_value,
+                  CASE WHEN parameter.type = excluded.type THEN parameter.default_value END))
     WHERE parameter.heard_at <= excluded.heard_at OR parameter.heard_at > ?"""
-"""The last value is the time after which stored times are from before the clock was set back."""
+"""The last value is the time after which stored times are from before the clock was set back. A default stays
+where the observer does not know it."""
 
 
 KnownLines = dict[tuple[int, str], tuple[int, float]]

@@ -111,9 +111,11 @@ def test_an_update_with_an_invalid_time_writes_nothing(cache: ParamCache) -> Non
     assert cache.vehicles() == []
 
 
-def test_another_firmware_has_other_defaults(cache: ParamCache) -> None:
-    param = Param("A", 1, ParamType.INT32, 0, 1, default=3)
+def test_defaults_stay_until_the_firmware_is_another(cache: ParamCache) -> None:
+    param = Param("A", 2, ParamType.INT32, 0, 2, default=3)
     cache.save(update(StoredParam.of(param, NOW), table=TableState(None, 1, complete=True, file_works=True)))
+    cache.save(update(stored("A", 1, at=NOW + 0.5)))  # of a program that does not know it
+    assert cache.component("1").params["A"].default == 3
     cache.save(update(at=NOW + 1, identity=replace(PX4, firmware=5)))
     table = cache.component("1")
     assert (table.params["A"].default, table.file_works) == (None, None)
