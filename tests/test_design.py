@@ -145,8 +145,9 @@ def is_in(module: str, rooms: tuple[str, ...] | set[str]) -> bool:
     return any(inside(module) == room or (room and inside(module).startswith(f"{room}.")) for room in rooms)
 
 
-def test_imports_are_absolute_and_point_one_way() -> None:
-    offenders = [each.place for _, each in all_imports() if each.module.startswith(".")]
+def test_imports_are_absolute_and_public_and_point_one_way() -> None:
+    """Linting finds relative ones, and private names of objects."""
+    offenders = [each.place for _, each in all_imports() if any(map(is_private, each.names))]
     for module, target, each in own_imports():
         room = max((room for room in MAY_IMPORT if is_in(module, {room})), key=len, default=None)
         if room is None:
@@ -214,22 +215,6 @@ def private_names_in(tree: ast.AST) -> set[str]:
             case ast.Attribute(attr=name, ctx=ast.Store()) | ast.Name(id=name, ctx=ast.Store()):
                 found.add(name)
     return set(filter(is_private, found))
-
-
-def test_no_module_uses_the_private_names_of_another() -> None:
-    """Those of a base class are its subclasses' too, for themselves: `self._x`."""
-    offenders = []
-    for module in MODULES:
-        own = private_names_in(source_of(module)) | NAMEDTUPLE_METHODS
-        for node in ast.walk(source_of(module)):
-            match node:
-                case ast.ImportFrom(names=aliases) if any(is_private(alias.name) for alias in aliases):
-                    offenders.append(f"{module}:{node.lineno}")
-                case ast.Attribute(value=ast.Name(id="self" | "cls")):
-                    continue
-                case ast.Attribute(attr=name) if is_private(name) and name not in own:
-                    offenders.append(f"{module}:{node.lineno} uses {name}")
-    assert offenders == []
 
 
 def test_no_test_uses_a_private_name_of_the_package() -> None:
