@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,27 +11,24 @@ import pytest
 from paramclient.model.values import ParamType
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
 from tests.simulated_on_udp import flying
+from tests.test_docs import ROOT, run
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parent.parent
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Callable[..., str]:
+    """Run a benchmark, which must end with an exit code; return what it prints."""
+
+    def call(name: str, *arguments: str, code: int = 0) -> str:
+        done = run(str(ROOT / f"bench/{name}.py"), *arguments, cwd=tmp_path)
+        assert done.returncode == code, done.stdout + done.stderr
+        return done.stdout
+
+    return call
 
 
-def bench(name: str, *arguments: str, code: int = 0) -> str:
-    """What a benchmark prints; it must end with this exit code."""
-    run = subprocess.run(
-        [sys.executable, f"bench/{name}.py", *arguments],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert run.returncode == code, run.stdout + run.stderr
-    return run.stdout
-
-
-def test_links_prints_the_row_of_exactly_this_name() -> None:
+def test_links_prints_the_row_of_exactly_this_name(bench: Callable[..., str]) -> None:
     name = "PX4 UDP 100 ms 20%"
     text = bench("links", "--row", name, "--seeds", "2")
     head, row = text.splitlines()
@@ -43,13 +38,13 @@ def test_links_prints_the_row_of_exactly_this_name() -> None:
     assert all(0.3 < float(figure) < 60 for figure in figures.groups()), text  # simulated seconds
 
 
-def test_gateway_prints_a_table() -> None:
+def test_gateway_prints_a_table(bench: Callable[..., str]) -> None:
     row, *_, own = bench("gateway", "--skip-direct", "--only", "PX4 clean").split("\n\n")[0].splitlines()[2:]
     assert re.fullmatch(r"\| PX4 clean \| pymavlink, the usual loop \|( \d+\.\d\d \|){4}  \|", row)
     assert re.fullmatch(r"\| PX4 clean \| the gateway itself \|  \|  \|( \d+\.\d\d \|){2} \d+ \|", own)
 
 
-def test_peers_prints_a_table_of_a_real_vehicle() -> None:
+def test_peers_prints_a_table_of_a_real_vehicle(bench: Callable[..., str]) -> None:
     with flying(PX4Vehicle(table={"MC_ROLL_P": 6.5, "MC_PITCH_P": 6.5})) as link:
         text = bench("peers", "--repeat", "1", "--only", "paramclient", "clean", "5%", "--live", link)
     _, _, *rows = text.splitlines()[:4]
@@ -58,7 +53,7 @@ def test_peers_prints_a_table_of_a_real_vehicle() -> None:
     assert re.search(r"PX4 quadrotor \d+\.\d+\.\d+", text), text
 
 
-def test_live_fails_with_check_where_a_value_is_wrong() -> None:
+def test_live_fails_with_check_where_a_value_is_wrong(bench: Callable[..., str]) -> None:
     """The vehicle answers the fetch at the beginning with another value than those after it."""
     vehicle = PX4Vehicle(table={"MC_ROLL_P": 6.5, "MC_AIRMODE": 3})
     vehicle.when_listed(2, lambda: vehicle.set_param("MC_AIRMODE", 2))
@@ -68,7 +63,7 @@ def test_live_fails_with_check_where_a_value_is_wrong() -> None:
     assert " missed |" in text
 
 
-def test_live_applies_values_in_groups_and_puts_everything_back() -> None:
+def test_live_applies_values_in_groups_and_puts_everything_back(bench: Callable[..., str]) -> None:
     switches = ("FENCE_ENABLE", "GRIP_ENABLE", "SCR_ENABLE", "FOLL_ENABLE")
     vehicle = ArduPilotVehicle(
         table=dict.fromkeys(switches, (ParamType.INT8, 0)),

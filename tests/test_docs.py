@@ -72,7 +72,7 @@ def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
         stdin=subprocess.DEVNULL,
         capture_output=True,
         encoding="utf-8",
-        timeout=60,
+        timeout=120,
         check=False,
     )
     done.stdout = "".join(f"{line.rstrip()}\n" for line in done.stdout.splitlines())

@@ -7,7 +7,6 @@ from pathlib import Path
 from paramclient.sim import Air, Camera, PX4Vehicle
 from tests.commands import Command, Put
 
-URL = "udpin:0.0.0.0:14550"
 CAMERA = ("--vehicle", "1/100", "--extended")
 
 

@@ -17,7 +17,6 @@ from tests.commands import Command, Put, metadata_file, strict
 from tests.conversations.partial import Partial
 from tests.shell import Eventful, Tap
 
-URL = "udpin:0.0.0.0:14550"
 TABLE: dict[str, Any] = {"A": 1.0, "B": 2}
 UID = "0a" * 18
 
