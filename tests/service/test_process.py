@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 
 import anyio
@@ -17,6 +17,7 @@ import httpx
 import pytest
 
 from paramclient.service import add_token
+from paramclient.service.server import CONNECTIONS_MAX
 from tests.commands import in_process
 from tests.service.hub import V, synced
 from tests.shell import TIMEOUT
@@ -90,6 +91,15 @@ async def test_it_wants_a_token_of_its_file(tmp_path: Path) -> None:
         assert (await browser.get("/api/vehicles")).status_code == 401
         browser.headers["Authorization"] = f"Bearer {token}"
         await synced(browser)
+
+
+@pytest.mark.asyncio
+async def test_connections_have_a_bound() -> None:
+    async with served("sim:px4", "--no-cache") as (_, browser), AsyncExitStack() as opened:
+        for _ in range(CONNECTIONS_MAX):
+            connection = await anyio.connect_tcp("127.0.0.1", browser.base_url.port or 0)
+            await opened.enter_async_context(connection)
+        assert (await browser.get("/health")).status_code == 503
 
 
 OTHERS = ["0.0.0.0:0", "[::]:0", "192.0.2.1:0", "station.example:0"]
