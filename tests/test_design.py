@@ -6,8 +6,6 @@ Each test lists all offenders.
 from __future__ import annotations
 
 import ast
-import subprocess
-import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
@@ -17,7 +15,7 @@ from typing import NamedTuple
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from tests.test_docs import ROOT, run
 
 MODEL = {"errors", "model"}
 PROTOCOL = MODEL | {"wire", "protocol"}
@@ -273,10 +271,7 @@ UNUSED |= {"pymavlink.mavutil", "pydantic", *LIBRARIES} - {"pymavlink", "asyncio
         ("import paramclient.cli", ON_USE),
     ],
 )
-def test_importing_loads_nothing_that_only_some_need(start: str, unwanted: set[str]) -> None:
+def test_importing_loads_nothing_that_only_some_need(start: str, unwanted: set[str], tmp_path: Path) -> None:
     """Start-up is part of the command's promise; mavutil, besides, changes the process that imports it."""
     program = f"import sys; {start}; print(sorted({unwanted!r} & sys.modules.keys()))"
-    run = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
-    )
-    assert run.stdout.strip() == "[]"
+    assert run("-c", program, cwd=tmp_path).stdout == "[]\n"

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +14,7 @@ import pytest
 from paramclient import ParamCache, Progress, Value, errors
 from paramclient.sync import Component, ParamClient, apply, for_each, plan, restore
 from tests.sync_stub import STUB, meaning, stub
+from tests.test_docs import run
 
 NAME = "MC_ROLL_P"
 SILENT = "udpin:127.0.0.1:0"
@@ -168,9 +167,7 @@ vehicle.set("MC_ROLL_P", 6.0)
 @pytest.mark.parametrize("end", ["", "del client, vehicle; gc.collect()", "1 / 0"])
 def test_a_program_that_does_not_close_its_client_keeps_its_values(tmp_path: Path, end: str) -> None:
     path = tmp_path / "cache"
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM + end, path], capture_output=True, text=True, timeout=60, check=False
-    )
+    done = run("-c", PROGRAM + end, str(path), cwd=tmp_path)
     assert done.returncode == (1 if "/" in end else 0), done.stderr
     with ParamCache(path) as cache:
         assert cache.component().params[NAME].value == 6.0
