@@ -247,6 +247,14 @@ async def test_extended_parameters_are_fetched_written_and_followed() -> None:
         assert live.json()["value"] == "hex:ff00fe"
 
 
+async def test_of_a_component_without_extended_parameters_no_event_tells_of_them() -> None:
+    async with browsing(generic()) as browser, events(browser) as stream:
+        problem(await browser.post(f"{V}/fetch", params=EXT, json={}), 504, "no-reply")
+        await browser.put(f"{V}/params/PARAM_04", json={"value": 9})
+        while (event := await stream.next())["type"] != "change":
+            assert not event["extended"]
+
+
 async def test_extended_parameters_are_set_up_and_restored(tmp_path: Path) -> None:
     async with camera(cache=str(tmp_path / "cache.sqlite3")) as browser:
 
