@@ -34,7 +34,7 @@ CHECK_LISTENING_TIME: Final = 2.2
 MEASURE_TIMEOUT: Final = 3.0
 """Seconds for one small request: longer than any measured round trip with repeats."""
 ROUND_TRIP_COUNT: Final = 10
-"""Number of round trips that are measured: enough for a median and a maximum."""
+"""Number of round trips that are measured: enough for a median and a maximum; fewer where they are long."""
 STEADY_SHARE: Final = 0.9
 """Share of the list up to which its rate is measured: after it come the repeats of lost values."""
 NOTABLE_LOSS: Final = 0.005
@@ -157,7 +157,8 @@ class _Check:
         """Measure the time from command to acknowledgement; stop if the vehicle acknowledges none."""
         trips: list[float] = []
         with suppress(TimeoutError):  # also NoReply
-            for _ in range(ROUND_TRIP_COUNT):
+            while len(trips) < ROUND_TRIP_COUNT and sum(trips) < MEASURE_TIMEOUT:
+                await anyio.sleep(self._component.node.channel.timing.slowest)  # for answers to repeats
                 began = anyio.current_time()
                 with anyio.fail_after(self._deadline.left(MEASURE_TIMEOUT)):
                     await request_message(self._component.node.channel, messages.AutopilotVersion)
