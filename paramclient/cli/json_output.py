@@ -300,7 +300,7 @@ def plan_json(plan: Plan, component: Component) -> JsonObject:
         "params": rows_json(row for row in plan.rows.values() if row.status != "unchanged"),
         "extra": len(plan.extra),
         "unchecked": len(plan.unchecked),
-        "reboot_for": plan.reboot_for,
+        "reboot_for": plan.reboot_for + plan.awaiting_reboot,
         **known_members(firmware=plan.firmware_note or None),
     }
 

@@ -84,8 +84,9 @@ async def test_long_pauses_and_clocks_that_go_back(tmp_path: Path) -> None:
     path = Log().beat().wait(86400.0).beat().wait(-1e6).beat().write(tmp_path / "flight.tlog")
     began = anyio.current_time()
     async with a_replay(path) as client:
+        component = await client.component()
         with pytest.raises(NoReply):
-            await (await client.component()).fetch_all()
+            await component.fetch_all()
         assert anyio.current_time() - began == pytest.approx(PAUSE_MAX, abs=0.1)
 
 
