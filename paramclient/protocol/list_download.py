@@ -298,8 +298,10 @@ class _Download:
             self._tried[index] = attempts
 
     def _missing(self) -> list[int]:
-        """Return the indices that were not received, or whose values were forgotten with their encoding."""
-        return self.table.missing(self._received & self.table.names.keys())
+        """Return the indices that were not received, or whose values were forgotten with their encoding, or
+        at a change of the count."""
+        self._received &= self.table.names.keys()
+        return self.table.missing(self._received)
 
     def _gaps(self) -> list[int]:
         """Return the indices to read: below the end of the list so far, or all that are missing.

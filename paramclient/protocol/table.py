@@ -113,8 +113,7 @@ class Table:
         """Return the indices without a parameter, or those that were not received. They begin at 1 if the
         count itself is one, and 0 is none."""
         present, count = self.names if received is None else received, self.count or 0
-        has_last = count in present and not self.is_growing
-        first = int(0 not in present and (self.begins_at_1 or has_last))
+        first = int(0 not in present and (self.begins_at_1 or (count in present and not self.is_growing)))
         return [index for index in range(first, first + count) if index not in present]
 
     @property

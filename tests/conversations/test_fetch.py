@@ -165,6 +165,14 @@ async def test_a_list_that_stops_is_completed() -> None:
             check_right(vehicle, await fetch_all(session))
 
 
+async def test_a_restart_after_a_change_of_the_count_leaves_nothing_missing() -> None:
+    vehicle = PX4Vehicle()
+    vehicle.when_listed(850, lambda: vehicle.use("WV_EN"))
+    vehicle.when_listed(900, vehicle.reboot)
+    async with talking(Air.symmetric([vehicle], delay=0.01)) as (_, session):
+        check_right(vehicle, await fetch_all(session))
+
+
 def is_no_file(message: messages.Message) -> bool:
     """Return whether a link that drops MAVFTP passes a message."""
     return not isinstance(message, messages.FileTransfer)
