@@ -140,10 +140,10 @@ class Watch:
                 await anyio.sleep(SETTLING_TIME)
             if not self._is_due and not interval.cancelled_caught:
                 continue
-            if not self._may_check:
+            self._is_due = not self._may_check  # it comes as soon as it may
+            if self._is_due:
                 await anyio.sleep(SETTLING_TIME)
                 continue
-            self._is_due = False
             try:
                 await self._check()
             except (NoReply, LinkError):

@@ -523,7 +523,9 @@ async def test_a_watch_finds_a_lost_announcement_for_one_request(is_cached: bool
             await anyio.sleep(31.0)
             assert len(conversation.sent_of(FileTransfer)) - before == 1
             vehicle.load({"ATC_RAT_RLL_P": 0.25})
-            await anyio.sleep(31.0)
+            with watch.held():  # as while a program writes
+                await anyio.sleep(31.0)
+            await anyio.sleep(1.1)
             assert node.plain.table.params["ATC_RAT_RLL_P"].value == 0.25
             assert Opcode.OPEN_FILE_RO not in opcodes(conversation)[before:]
             vehicle.load(dict.fromkeys(NAMES[300:700:20], 3))  # as a written param.pck: not announced
