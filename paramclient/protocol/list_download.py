@@ -257,7 +257,8 @@ class _Download:
         attempts_max = self._attempts_max()  # once, where a false count makes thousands of gaps
         given_up = sum(self._tried.get(index, 0) >= attempts_max for index in missing)
         is_fruitless = self.table.is_growing or given_up >= self.channel.window_size
-        return given_up == len(missing) or (is_fruitless and now - self._last >= UNANSWERED_MAX)
+        patience = UNANSWERED_MAX if is_fruitless else 2 * UNANSWERED_MAX
+        return given_up == len(missing) or now - self._gained_at >= patience
 
     def _is_given_up(self, index: int) -> bool:
         return self._tried.get(index, 0) >= self._attempts_max()

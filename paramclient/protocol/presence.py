@@ -105,8 +105,7 @@ class Presence:
         before, at = self._clocks.get(message_id, (0, now))
         passed = 1000 * (now - at)
         possible = passed + 1000 * PATH_LATENCY_MAX
-        has_wrapped = boot_ms + BOOT_CLOCK_WRAP - before <= possible
-        is_back = boot_ms < before and not has_wrapped
+        is_back = boot_ms < before and boot_ms + BOOT_CLOCK_WRAP - before > possible  # without a wrap
         is_late = boot_ms > possible or before + passed - boot_ms <= 1000 * REORDERING_TIME
         if is_back and is_late:
             return False
