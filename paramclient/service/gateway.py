@@ -143,7 +143,7 @@ class Gateway:
             return
         for link in self.links:
             link.avoid(frame.system)
-        message = decode(frame) if seen.is_proven else None
+        message = decode(frame)
         if isinstance(message, Request):
             station.requests[type(message).__name__] += 1
             if self._answer(station, source, message, seen):

@@ -455,7 +455,8 @@ class KeptTable(Stream[Change]):
         if code == ParamErrorCode.COMPONENT_NOT_FOUND and known_param(self.session, name):
             self.session.table.doubt(name)  # it may have the new value
             self.changes += 1
-            self.component.core.spawn(read_again, self.session, name, anyio.current_time())
+            await read_again(self.session, name, anyio.current_time())
+            self.changes += 1  # also if it has the old one
 
     async def _wait_longer(self, key: SetKey, scope: anyio.CancelScope) -> None:
         """Pass it on that a component works on a set of an extended parameter, and wait for its end then."""

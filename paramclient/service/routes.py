@@ -31,7 +31,6 @@ from paramclient.files import FileFormat, ParamFile, dumps, loads, writable
 from paramclient.files.formats import ENDINGS
 from paramclient.model.names import NameChoice
 from paramclient.model.paramset import ParamSet
-from paramclient.model.values import check_name
 from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision import ApplyProgress, apply, restore
 from paramclient.provision import plan as plan_of
@@ -448,8 +447,7 @@ async def _wanted(target: Target, body: PlanRequest) -> ParamSet:
         found = await target.state_at(body.at)
     else:
         values = await target.values(body.values or {})
-        checked = {check_name(name): value for name, value in values.items()}
-        found = ParamSet(checked, is_extended=target.component.is_extended)
+        found = ParamSet(values, is_extended=target.component.is_extended)
     return found if body.only is None else found.only(body.only)
 
 
