@@ -109,8 +109,8 @@ async def test_snapshots_are_stored_listed_read_and_applied(cache: str) -> None:
         assert [name for name, each in plan["params"].items() if each["status"] == "set"] == ["PARAM_04"]
         assert "PARAM_04\t4\t" in (await browser.get(f"{V}/file", params=query)).text
         problem(await browser.get(f"{V}/params?at=99"), 404, "not-in-cache")
-    distant = Air.symmetric([small_px4()], delay=1.0)  # its identity comes behind the first heartbeat
-    async with service(distant, cache=cache, fetches=False) as (_, browser):
+    # the identity of one far away comes behind the first heartbeat
+    async with service(Air.symmetric([small_px4()], delay=1.0), cache=cache, fetches=False) as (_, browser):
         await until(browser, "/api/vehicles", lambda found: bool(found["vehicles"]))
         assert (await browser.get(f"{V}/snapshots")).json()["snapshots"] == [kept]
 
