@@ -127,7 +127,10 @@ async def _ask(
     def accept(message: Message) -> ReportedValue | None:
         if isinstance(message, ParamError):
             raise refusal(session, which, message.error)
-        return message if isinstance(message, dialect.value) else None
+        known = table.params.get(which if isinstance(which, str) else table.names.get(which, ""))
+        if isinstance(message, dialect.value) and (known is None or known.type == message.param_type):
+            return message
+        return None  # in another type, a value acknowledges a set
 
     def requests_max() -> int:  # of this moment: the loss is better known with each answer
         most = requests or timing.attempts_max

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
@@ -11,7 +12,7 @@ from weakref import WeakValueDictionary
 import anyio
 
 from paramclient.errors import AnotherVehicle, NoReply
-from paramclient.model.values import Encoding, Param, ParamType, Trust
+from paramclient.model.values import Param, ParamType, Trust
 from paramclient.protocol.channel import Channel, Gate
 from paramclient.protocol.dialect import Dialect, Digest, ReportedValue
 from paramclient.protocol.ftp import FTP_SILENT_TIME, SILENT_LOST
@@ -158,7 +159,7 @@ class Session:
         control: taken for the reads that decide this: the answer to another one would be taken for theirs.
         listing: the list that is downloaded in place of reads that are not answered.
         seeking: the reads for evidence of the encoding.
-        acknowledging: names whose next value may acknowledge a set, in another type than the parameter's.
+        acknowledging: by name, sets that a value in another type than the parameter's may acknowledge yet.
         observers: called with the parameters received and their number, while a fetch runs.
     """
 
@@ -192,7 +193,7 @@ class Session:
         self.control = anyio.Lock()
         self.listing: Shared[Any] = Shared(spawn, channel.gate)
         self.seeking: Shared[None] = Shared(spawn, channel.gate)
-        self.acknowledging: set[str] = set()
+        self.acknowledging: Counter[str] = Counter()
         self.observers: set[Callable[[int, int | None], None]] = set()
         self._identified = identified
         self._locks: WeakValueDictionary[str, anyio.Lock] = WeakValueDictionary()
@@ -214,14 +215,14 @@ class Session:
         is_listed = message.param_index != NO_INDEX and spelled not in self.table.params
         if name != spelled and self.identification.is_ardupilot and not is_listed:
             name, message = spelled, message._replace(param_id=spelled)
+        message = self.typed(message)
         _, raw, number, _, _ = message
         table, replaced, is_sent = self.table, self.replaced.get(name), self.sent.get(name) == raw
         known, may_read = table.params.get(name), not self.identification.listens_only
-        is_bytes = table.encoding is Encoding.BYTEWISE
-        if name in self.acknowledging and is_bytes and known and known.type != number:
+        if known and known.type != number and known.trust is not Trust.CACHED and self.acknowledging[name]:
+            self.acknowledging[name] -= 1
             return None
-        message = self.typed(message)
-        is_other = known is not None and not table.is_reported(known, raw, message.param_type)
+        is_other = known is not None and not table.is_reported(known, raw, number)
         is_answer = message.param_index != NO_INDEX or (name in self.reading and not is_sent)
         until = table.moments.get(name, -math.inf) + LATE_TIME
         behind = (self._sequences.get(name, sequence) - sequence) % 256
@@ -231,7 +232,7 @@ class Session:
         asked = min(self.reading.get(each, now) for each in (name, message.param_index))
         is_late = replaced is not None and (now <= replaced.until or asked < replaced.until - LATE_TIME)
         if replaced is not None and is_late and is_other:
-            was_it = any(table.is_reported(each, raw, message.param_type) for each in replaced.params)
+            was_it = any(table.is_reported(each, raw, number) for each in replaced.params)
             if is_answer or (was_it and not is_sent):
                 return replaced.until
         is_first = (known is None or known.trust is not Trust.LIVE) and not is_sent

@@ -37,6 +37,8 @@ from paramclient.wire.messages import Message, ParamError, ParamExtAck, StatusTe
 
 SILENT_SETS_MAX: Final = 3
 """Sets without an acknowledgement, after which a read shows the value: some firmware acknowledges none."""
+ACKS_MAX: Final = 2
+"""Acknowledgements of one set: some firmware sends the old value first, and PX4 the new one twice."""
 SETS_MIN: Final = 5
 SETS_MAX: Final = 12
 SETS_TIME: Final = 5.0
@@ -121,7 +123,6 @@ async def write(
                 result = await _settled(session, vehicles, result, settle)
             return result
         finally:
-            session.acknowledging.discard(name)
             session.sent.pop(name, None)
             del session.writing[name]
             session.written_at = anyio.current_time()
@@ -312,12 +313,8 @@ class _Write:
             kind = ValueUnsupported if answer.param_result == ExtAckResult.VALUE_UNSUPPORTED else SetFailed
             why = f"{channel} refused {self.name}: {ExtAckResult.name_of(answer.param_result)}"
             refused = kind(why, *channel.target, code=answer.param_result, name=self.name)
-        elif isinstance(answer, Param):
-            if answer.type == self.before.type:
-                return answer
-            # Acknowledgements of repeated sets, in this type too, would answer the read: they come first.
-            await anyio.sleep(channel.timing.slowest + channel.timing.timeout(0))
-            self.session.acknowledging.discard(self.name)
+        elif isinstance(answer, Param) and answer.type == self.before.type:
+            return answer
         if not channel.is_silent(self._began):
             with suppress(NoReply):  # only a read shows a changed type, or an extended parameter's value
                 shown = await self._read(inbox)
@@ -341,10 +338,9 @@ class _Write:
         """Return the set, and count it as sent."""
         self.attempts += 1
         self.report(None)
-        self.session.acknowledging.add(self.name)
+        self.session.acknowledging[self.name] += ACKS_MAX
         self.session.sent[self.name] = self._raw
-        dialect, number = self.session.dialect, self.before.type
-        return dialect.set_request(*self.channel.target, self.name, self._raw, number)
+        return self.session.dialect.set_request(*self.channel.target, self.name, self._raw, self.before.type)
 
     def _accept(self, message: Message) -> Param | ParamExtAck | None:
         """Return an acknowledgement: PARAM_EXT_ACK, the wanted value, or any in another type."""

@@ -284,11 +284,12 @@ async def test_a_component_with_one_parameter_and_no_list_is_fetched() -> None:
         assert (await fetch_all(session)).complete
 
 
-async def test_late_acknowledgements_in_another_type_are_no_new_type() -> None:
-    vehicle = Partial(serves=("names", "sets", "commands"))
+@pytest.mark.parametrize(("reads", "delay"), [(["names"], 0.15), (["list", "indices"], 0.0)])
+async def test_late_acknowledgements_in_another_type_are_no_new_type(reads: list[str], delay: float) -> None:
+    vehicle = Partial(serves=(*reads, "sets", "commands"))
     ack = messages.ParamValue("MODE", struct.pack("<i", 9), ParamType.REAL32, 8, 5)
     late = Eventful(vehicle, *((at, partial(vehicle.say, ack)) for at in (0.9, 1.1)))
-    async with talking(Air.symmetric([late], delay=0.15)) as (_, session):
+    async with talking(Air.symmetric([late], delay=delay)) as (_, session):
         assert (await write(session, "MODE", 9)).status == "accepted"
     assert vehicle.values["MODE"] == ack.raw
 
