@@ -37,7 +37,7 @@ class SimParam:
         type: any MAV_PARAM_TYPE, or the number of a type that MAVLink does not define.
         value: within the type; four raw bytes for a type that MAVLink does not define.
         volatile: whether PX4 excludes the parameter from the hash.
-        default: the firmware's default as the number in its source, or None if unknown.
+        default: the firmware's default as the number in its source; None for the value.
         bits: the value's own bytes, as in `paramclient.Param.bits`.
 
     Raises:
@@ -97,12 +97,12 @@ class Entry:
     def packed(self) -> PackedParam | None:
         """The entry in param.pck, with its default if that differs; None for a type that param.pck lacks."""
         if self._packed is None and self.type in PACKABLE:
-            kind, default, other = ParamType(self.type), self.row.default, None
-            if default is not None:
-                one, two = struct.unpack("<2f", struct.pack("<2f", float(self.value), default))
-                if not abs(one - two) < FLT_EPSILON:
-                    whole = int(default) & (1 << 8 * kind.size) - 1
-                    other = whole if kind.is_integer else bits_of(default, kind)
+            kind, other = ParamType(self.type), None
+            default = float(self.row.value) if self.row.default is None else self.row.default
+            one, two = struct.unpack("<2f", struct.pack("<2f", float(self.value), default))
+            if not abs(one - two) < FLT_EPSILON:
+                whole = int(default) & (1 << 8 * kind.size) - 1
+                other = whole if kind.is_integer else bits_of(default, kind)
             self._packed = PackedParam(self.name, kind, self.bits, other)
         return self._packed
 

@@ -16,7 +16,7 @@ from paramclient.model.values import ParamType
 from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.ftp import FileCutOff, Opcode, Packet, checksum, path_bytes, read_file
 from paramclient.protocol.param_pck import PackedParam, encode
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.wire.messages import FileTransfer, Message, ParamValue
 from paramclient.wire.messages import encode as frame
 from tests.conversations.virtual import losing, meanwhile, talking, virtual_on_both
@@ -225,8 +225,7 @@ async def test_a_fetch_does_not_wait_for_another_file(is_cached: bool) -> None:
 
 
 async def test_integers_of_a_file_are_exact_and_keep_so_beside_rounded_messages() -> None:
-    vehicle = ArduPilotVehicle()
-    name = next(each.name for each in vehicle.listed if each.type == 6 and each.name.startswith("COMPASS"))
+    vehicle, name = ArduPilotVehicle(table=[SimParam("A", ParamType.INT32, 5)]), "A"
     vehicle.set_param(name, 2**24 + 1)
     async with talking(vehicle) as (conversation, session):
         result = await fetch_all(session)
@@ -234,7 +233,8 @@ async def test_integers_of_a_file_are_exact_and_keep_so_beside_rounded_messages(
         assert result.params[name].value == 2**24 + 1
         conversation.hear(ParamValue(name, b"\0\0\x80\x4b", 6, result.count, 65535))  # 2**24 as float32
         assert session.table.params[name].value == 2**24 + 1
-        assert isinstance(session.table.params[name].default, int)
+        default = session.table.params[name].default
+        assert (default, type(default)) == (5, int)
 
 
 async def test_a_refused_file_is_not_requested_again_on_the_link() -> None:
