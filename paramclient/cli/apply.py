@@ -32,7 +32,7 @@ from paramclient.provision.apply_rules import CATEGORIES, READ_ONLY
 from paramclient.provision.execution import ApplyOptions, ApplyProgress, ApplyResult
 from paramclient.provision.inspection import plan, plan_for, wait_for_identity
 from paramclient.provision.planning import ApplyRow, ApplyStatus, Plan, Rows
-from paramclient.provision.sources import NO_DEFAULTS, choose, is_file, read_source
+from paramclient.provision.sources import NO_DEFAULTS, choose, is_file, link_of, read_source
 
 _WORDS: Final = {ApplyStatus.SET: "to set", ApplyStatus.LATER: "that may be revealed"}
 """Words for planned actions in the summary, where they differ from the status."""
@@ -111,7 +111,7 @@ async def restore(url: str, when: str | None = None, /, *, options: ApplyFlags =
             since then; an apply that continues an interrupted one within an hour counts with it as one. With
             --vehicle all, a time, or a backup file with {uid} or {system} in its name.
     """
-    if when is None or not (is_file(when) or is_pattern_name(when)):
+    if when is None or not (is_file(when) or is_pattern_name(when) or link_of(when) != when):
         try:
             moment = None if when is None else parse_moment(when, time.time())
         except errors.UsageError as error:

@@ -52,8 +52,7 @@ def test_a_table_is_read_as_it_was_written(cache: ParamCache, open_cache: Open) 
         for index, (name, (kind, bits)) in enumerate(kinds.items())
     ]
     raw = Param("RAW", b"\1\2\3\4", ParamType.INT64, None, 0x04030201, Trust.CACHED)
-    default = replace(params[1], name="WITH_DEFAULT", index=6, default=-5)
-    table = [*params, raw, default]
+    table = [*params, raw, replace(params[1], name="WITH_DEFAULT", index=6, default=-5)]
     cache.save(update(*(StoredParam.of(each, NOW) for each in table), table=TableState(None, 7)))
     found = open_cache().component(PX4.key)
     assert {name: (param, param.default) for name, param in found.params.items()} == {

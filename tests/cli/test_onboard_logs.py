@@ -34,6 +34,7 @@ def test_logs_of_every_format_are_compared(command: Command, tmp_path: Path) -> 
         assert f"(incomplete: {words} parameters, " in command("show", DATA / f"{name}.tlog").err
     changed = command("show", DATA / "ardupilot_enable_groups.tlog").err
     assert "(incomplete: 1402 parameters; of the list of 1382 without index 0, " in changed
+    assert "the state: 903 parameters of " in command("restore", "sim:px4", telemetry, "--dry-run").err
     saved = command("save", telemetry, tmp_path / "quad.param")
     assert (saved.code, saved.err[:16]) == (0, "903 parameters o")
 
