@@ -49,8 +49,9 @@ PROBE_INTERVAL: Final = 0.5
 LISTENING_TIME: Final = HEARTBEAT_WAIT
 """Seconds after the client was opened in which components are waited for, by a fetch of all."""
 SILENT_TIME: Final = 2.95
-"""Seconds from the begin for a component that has never answered a request, where another one on the link
-answers: it costs no more than 3 s. An ArduPilot or PX4 has parameters, and may still be starting."""
+"""Seconds from the begin for a component that has never answered a request, or of a kind that usually has
+extended parameters, where another one on the link answers: it costs no more than 3 s. An ArduPilot or PX4 has
+parameters, and may still be starting."""
 EVENTS_MAX: Final = 1_000
 """Queued events for a consumer, at most."""
 

@@ -367,8 +367,7 @@ class Channel:
         """
         now, heard = anyio.current_time(), self.presence.received_at
         silence_max = min(self.presence.timeout, SILENCE_MAX)
-        since = heard if began - heard < silence_max else began
-        return now - since >= silence_max
+        return now - (heard if began - heard < silence_max else began) >= silence_max
 
     def is_hopeless(self, attempts: int, began: float, attempts_max: int | None = None) -> bool:
         """Return whether to give up a request that was sent so often since `began`.

@@ -470,7 +470,8 @@ async def _seek_evidence(session: Session) -> None:
     """
     channel, table = session.channel, session.table
     if session.serves_reads.get(int) is False:
-        await session.listing.join(lambda: download_list(session))
+        with suppress(NoReply):  # it has no list either
+            await session.listing.join(lambda: download_list(session))
         return
     with channel.inbox(session.dialect.value) as inbox:
         for first in range(0, min(EVIDENCE_MAX, table.count or EVIDENCE_MAX), EVIDENCE_READS):
