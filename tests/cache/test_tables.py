@@ -90,9 +90,8 @@ def test_extended_parameters_are_apart(cache: ParamCache) -> None:
     assert dict(found.params) == {"P_0": text, "P_1": number}
     assert (found.count, found.complete) == (2, True)
     assert found.params["P_0"].value == "café"
-    assert [(each.key, each.component, each.size) for each in cache.components(extended=True)] == [
-        (PX4.key, 100, 2)
-    ]
+    cameras = [(each.key, each.component, each.size) for each in cache.components(extended=True)]
+    assert cameras == [(PX4.key, 100, 2)]
     assert [(each.component, each.size) for each in cache.components()] == [(100, 0)]
     other = ext_param("P_0", b"tea", ParamType.CUSTOM, 0)
     cache.save(update(StoredParam.of(other, NOW + 1, by="us"), at=NOW + 1, component=100, extended=True))

@@ -156,9 +156,8 @@ print(json.dumps(found))
 def test_the_command_writes_logs_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "flight.tlog"
     assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache", "--tlog", str(path)]) == 0
-    assert [each.param_id for each in recorded(path) if isinstance(each, messages.ParamValue)] == [
-        "MC_ROLL_P"
-    ]
+    names = [each.param_id for each in recorded(path) if isinstance(each, messages.ParamValue)]
+    assert names == ["MC_ROLL_P"]
     assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache", "--tlog", str(path)]) == 2
     assert "flight.tlog exists" in capsys.readouterr().err
     assert run(["link", "sim:px4", "--seconds", "0.1", "--tlog", str(tmp_path / "link.tlog")]) == 0

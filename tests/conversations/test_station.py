@@ -120,9 +120,8 @@ async def test_values_received_before_the_encoding_is_known_are_decoded_again_an
         assert not conversation.changes
         conversation.hear(ARDUPILOT)
         assert table.params["RTL_ALT"].value == 1500
-        assert [(each.new and each.new.value, each.kind) for each in conversation.changes] == [
-            (1500, "first")
-        ]
+        changes = [(each.new and each.new.value, each.kind) for each in conversation.changes]
+        assert changes == [(1500, "first")]
 
 
 async def test_the_heartbeat_of_a_vehicle_that_sends_other_messages_is_requested() -> None:
