@@ -148,10 +148,10 @@ async def save(
 ) -> int:
     """Write the parameters of a vehicle to a file, in the file format of any ground station.
 
-    An existing file is replaced once the new one is completely on the disk. An incomplete table is written
-    with --incomplete only. Exit code 1: the table is incomplete, or with --changed, no parameter differs or
-    the defaults are not known. With --vehicle all, a file with {system} or {uid} in its name becomes a file
-    for each vehicle; otherwise the file format must be able to hold several components.
+    An existing file is replaced once the new one is completely on the disk. An incomplete table of a vehicle
+    is written with --incomplete only. Exit code 1: the table is incomplete, or with --changed, no parameter
+    differs or the defaults are not known. With --vehicle all, a file with {system} or {uid} in its name
+    becomes a file for each vehicle; otherwise the file format must be able to hold several components.
 
     Args:
         where: The link, such as udpin:0.0.0.0:14550 or sim:px4; an on-board log (.bin, .ulg), for the values
