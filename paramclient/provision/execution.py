@@ -40,14 +40,14 @@ BEFORE_APPLY: Final = "before apply"
 """The reason of the snapshot that `apply` stores before its first write."""
 BEFORE_RESTORE: Final = "before restore"
 """The reason of the snapshot that `restore` stores before its first write."""
-UNREAD: Final = "acknowledged, and not read back"
-"""The reason of a row whose value is not proven."""
 WRITE_ATTEMPTS_MAX: Final = 2
 """Times that a value is written if the vehicle acknowledges it and later holds another value: a write of
 another parameter may have changed it."""
 VERIFY_DELAY: Final = 1.2
 """Seconds between the last write and the read that verifies it: modules of PX4 clamp the value, or set other
 parameters, up to 1.1 s after the acknowledgement (measured)."""
+OUTCOMES_TIME: Final = 0.1
+"""Seconds after the timeout of a run in which its writes, which end at that, still give their outcomes."""
 POLL_INTERVAL: Final = 0.05
 """Seconds between two looks at the armed state, for which there is no event."""
 ARMED_STATE_TIMEOUT: Final = 3.0
@@ -157,7 +157,7 @@ async def run(
     error: ParamClientError | None = None
     one = _Run(component, wanted, options, is_restore=is_restore)
     try:
-        with anyio.move_on_after(seconds_of(options.get("timeout"))) as scope:
+        with anyio.move_on_after(seconds_of(options.get("timeout")) + OUTCOMES_TIME) as scope:
             await one.begin()
             with component.watch.held():  # a changed count starts no download besides those of the run
                 await one.store_state()
@@ -193,6 +193,7 @@ class _Run:
         self.component, self.wanted, self.options = component, wanted, options
         self.is_restore, self._reboots_allowed = is_restore, options.get("reboot", False)
         self.sent: set[str] = set()
+        self._writes_until = anyio.current_time() + seconds_of(options.get("timeout"))
         self._before: ParamSet | None = None  # the state before the first write
         self._end_operation: Callable[[], None] | None = None  # records in the cache that the run has ended
         self._settled: dict[str, ApplyRow] = {}  # outcomes before the last read
@@ -395,6 +396,7 @@ class _Run:
                 force=self.options.get("force", False),
                 author=self.options.get("author"),
                 progress=lambda outcome: self._take(by_name[outcome.name], outcome),
+                timeout=max(self._writes_until - anyio.current_time(), 0.0),
             )
         except ParamClientError:
             self.sent &= before
@@ -421,7 +423,7 @@ class _Run:
 
     async def _write_system_id(self, row: ApplyRow) -> None:
         """Set the system id, and continue with the vehicle under its new one."""
-        component, system = self.component, int(row.wanted.value)
+        component, system, author = self.component, int(row.wanted.value), self.options.get("author")
         now = plan_for(component, self.wanted, self._inspection, self.options).rows[row.name]
         if now.status is ApplyStatus.REFUSED:  # another vehicle has appeared
             self._settle(row, now.status, now.reason, now.category)
@@ -433,9 +435,7 @@ class _Run:
         self._written_at, is_acknowledged = math.inf, False
         try:
             with suppress(NoReply):  # it may have its new id before it acknowledges
-                await component.set(
-                    row.name, system, timeout=SYSTEM_CHANGE_TIMEOUT, author=self.options.get("author")
-                )
+                await component.set(row.name, system, timeout=SYSTEM_CHANGE_TIMEOUT, author=author)
                 is_acknowledged = True
             self.component = await component.client.successor(
                 component, system, timeout=SYSTEM_CHANGE_TIMEOUT
@@ -504,7 +504,7 @@ class _Run:
     def _accept(self, row: ApplyRow, note: str = "") -> None:
         self._count_write(row)
         self._notes[row.name] = note
-        self._report("writing", self._outcome(row, ApplyStatus.UNPROVEN, UNREAD))
+        self._report("writing", self._outcome(row, ApplyStatus.UNPROVEN, "acknowledged, and not read back"))
 
     def _settle(self, row: ApplyRow, status: ApplyStatus, reason: str, category: str = "") -> None:
         """Record an outcome that only the verification may still change, and report it."""

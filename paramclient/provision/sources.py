@@ -177,8 +177,7 @@ def choose(file: ParamFile, component: int | None, system: int | None) -> ParamS
     Raises:
         FileError: the file has no parameters for it.
     """
-    is_of_several = len({each.system for each in file.sets}) > 1
-    found = file.choose(component, system=system if is_of_several else None)
+    found = file.choose(component, system=system if len({each.system for each in file.sets}) > 1 else None)
     component = component if found.component is None else found.component
     return replace(found, system=found.system or system, component=component)
 

@@ -35,7 +35,7 @@ from paramclient.protocol.set_results import SetOutcome, SetStatus
 from paramclient.provision import ApplyProgress, apply, restore
 from paramclient.provision import plan as plan_of
 from paramclient.provision.apply_restore import load_restore_point
-from paramclient.provision.sources import fetched_set, select_non_defaults
+from paramclient.provision.sources import choose, fetched_set, select_non_defaults
 from paramclient.service.hub import Hub, Target
 from paramclient.service.problems import ServiceError
 from paramclient.version import __version__
@@ -149,10 +149,8 @@ class UploadedFile(Body):
 
     def read_set(self, component: Component) -> ParamSet:
         """Parse the file, and return its set for a component; see `read`."""
-        file = self.read()
-        is_of_several = len({each.system for each in file.sets}) > 1
         chosen = component.component if self.component is None else self.component
-        return file.choose(chosen, system=component.system if is_of_several else None)
+        return choose(self.read(), chosen, component.system)
 
 
 class PlanOptions(Body):

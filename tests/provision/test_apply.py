@@ -237,6 +237,7 @@ async def test_the_timeout_ends_the_run() -> None:
         assert result.elapsed < limit + 0.5
         assert isinstance(result.error, NoReply)
         assert "sent, not acknowledged" in {row.reason[:22] for row in result.of(ApplyStatus.UNKNOWN)}
+        assert result.of(ApplyStatus.NOT_TRIED)
         assert residue(component) == []
 
 
