@@ -9,10 +9,10 @@ from paramclient.cli import output
 from paramclient.cli.cached import show_summaries
 from paramclient.cli.json_output import info_json, info_of, param_value, set_json, table_param_json, taken
 from paramclient.cli.metadata import METADATA_HINT, MetadataFile, default_in, known_of_sets, say_sources
-from paramclient.cli.options import CacheOptions
+from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import ExitCode, cells_of, local_time, print_line, report, say
 from paramclient.cli.session import check_given
-from paramclient.cli.sources import check_link, described, part_of
+from paramclient.cli.sources import described, part_of, sets_of
 from paramclient.errors import UsageError, VehicleError
 from paramclient.files.formats import address
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo
@@ -22,7 +22,7 @@ from paramclient.model.names import NameChoice, counted
 from paramclient.model.notation import time_text
 from paramclient.model.paramset import add_defaults
 from paramclient.model.values import check_name
-from paramclient.provision.sources import NO_DEFAULTS, choose_names, link_of, read_source, resolve, tables_in
+from paramclient.provision.sources import NO_DEFAULTS, choose_names, read_source, tables_in
 
 
 async def show(
@@ -57,9 +57,9 @@ async def show(
                 show_summaries(cache, summaries, json=options.json)
                 return ExitCode.DONE
             vehicle = f"cache:{summaries[0].key}"
-        check_link(link_of(vehicle))
         found = read_source(vehicle, every=True, extended=extended, incomplete=True, cache=cache)
-        sets = [await resolve(vehicle, cache=False, incomplete=True)] if found is None else found.sets
+        link = LinkOptions(cache=options.cache, extended=extended)
+        sets = found.sets if found is not None else (await sets_of(vehicle, link, incomplete=True))[0]
     kept = choose_names(chosen, sets)
     views = []
     for whole, known in zip(sets, known_of_sets(sets, options, metadata), strict=True):

@@ -95,9 +95,8 @@ def known(cache: Path) -> None:
 @pytest.mark.usefixtures("known")
 def test_history_prints_the_cached_changes_since_a_time(command: Command) -> None:
     found = command("history", "1", "--json").json["history"]
-    assert [(each["component"], each["name"], each["old"], each["new"]) for each in found] == [
-        *((1, "A", 1, 2), (1, "B", 1, 2), (154, "C", 1, 2)),
-    ]
+    lines = [(each["component"], each["name"], each["old"], each["new"]) for each in found]
+    assert lines == [(1, "A", 1, 2), (1, "B", 1, 2), (154, "C", 1, 2)]
     first = time_text(HOUR_AGO + 600)
     assert command("history", "1", "A").words == [
         ["time", "component", "name", "old", "new", "by"],

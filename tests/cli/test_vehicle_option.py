@@ -62,13 +62,14 @@ def test_a_read_says_which_vehicle_it_shows(command: Command, put: Put) -> None:
     Also if the command ends before the other one is heard.
     """
     url = put(Air([px4(), copter()]))
-    several = command("fetch", url)
-    assert several.rows[0][0] == command("show", "sim:px4", "MC_ROLL_P").rows[0][0] == "vehicle"
-    assert re.search(
-        r"[14]/1 \w+ was used, the first vehicle heard\. Also on this link: [14]/1 \w+ quadrotor\. "
-        r"--vehicle chooses one\n",
-        several.err,
-    )
+    for words in (("fetch", url), ("show", url, "A")):
+        several = command(*words)
+        assert several.rows[0][0] == "vehicle"
+        assert re.search(
+            r"[14]/1 \w+ was used, the first vehicle heard\. Also on this link: [14]/1 \w+ quadrotor\. "
+            r"--vehicle chooses one\n",
+            several.err,
+        )
     assert command("get", url, "A", "--json").json["system"] in (1, 4)
     named = command("fetch", url, "--vehicle", 1)
     assert (named.rows[0][0], "Also on this link" in named.err) == ("name", False)
