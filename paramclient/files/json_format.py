@@ -153,7 +153,8 @@ def _no_constant(word: str) -> NoReturn:
 
 def _line_of(text: str, key: str, *, last: bool = False) -> int | None:
     """Return the line of a key, if the key occurs once or the last occurrence is meant."""
-    places = [match.start() for match in re.finditer(rf'"{re.escape(key)}"[ \t]*:', text)]
+    written = f'"{re.escape(key)}"|{re.escape(json.dumps(key))}'  # also with escapes
+    places = [match.start() for match in re.finditer(rf"(?:{written})[ \t]*:", text)]
     return text.count("\n", 0, places[-1]) + 1 if places and (last or len(places) == 1) else None
 
 

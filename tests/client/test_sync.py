@@ -435,9 +435,8 @@ async def test_a_vehicle_that_is_lost_ends_a_fetch_with_what_came(kind: str, kno
         assert "The component was lost." in result.notes
         assert 50 < result.received == len(result.params) - len(result.cached) < result.count
         assert (len(result.params) == result.count) is known
-        assert {result.params[name].index for name in result.cached} == (
-            set(result.missing) if known else set()
-        )
+        missing = set(result.missing) if known else set()
+        assert {result.params[name].index for name in result.cached} == missing
         values = result.params.items()
         assert {name for name, each in values if not each.same_value(vehicle.param(name))} <= set(
             result.cached

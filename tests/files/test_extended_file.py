@@ -87,6 +87,7 @@ def test_a_file_is_of_one_kind_and_other_formats_cannot_hold_them(tmp_path: Path
         (of({"value": 5, "type": "TYPE_77"}), "TYPE_77 is not a type that MAVLink defines"),
         ([{"extended": 1, "params": {}}], "should be true or false, found 1"),
         ([{"params": {"A": TEXT}}], "a plain parameter is a number"),
+        ([{"params": {"Ä": {"value": 1}}}], "json:1: .*only printable ASCII"),  # written as an escape
         ([{"params": {"A": {"value": "0x0000000102", "type": "INT8"}}}], "or four raw bytes"),
         (
             [{"params": {"A": {"value": 1}}}, *of({"value": 1, "type": "INT8"})],
