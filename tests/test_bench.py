@@ -21,7 +21,7 @@ def bench(tmp_path: Path) -> Callable[..., str]:
     """Run a benchmark, which must end with an exit code; return what it prints."""
 
     def call(name: str, *arguments: str, code: int = 0) -> str:
-        done = run(str(ROOT / f"bench/{name}.py"), *arguments, cwd=tmp_path)
+        done = run(str(ROOT / f"bench/{name}.py"), *arguments, cwd=tmp_path, timeout=120.0)
         assert done.returncode == code, done.stdout + done.stderr
         return done.stdout
 

@@ -62,7 +62,7 @@ def outputs() -> dict[str, str]:
     return {code: text for page in PAGES for code, text in SHOWN.findall(page.read_text(encoding="utf-8"))}
 
 
-def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+def run(*arguments: str, cwd: Path, timeout: float = 60.0) -> subprocess.CompletedProcess[str]:
     """Run Python in a folder, with a cache of its own; trailing spaces of the output are cut."""
     folders = dict.fromkeys(("XDG_CACHE_HOME", "XDG_STATE_HOME", "TMPDIR"), str(cwd))
     done = subprocess.run(
@@ -72,7 +72,7 @@ def run(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
         stdin=subprocess.DEVNULL,
         capture_output=True,
         encoding="utf-8",
-        timeout=120,
+        timeout=timeout,
         check=False,
     )
     done.stdout = "".join(f"{line.rstrip()}\n" for line in done.stdout.splitlines())

@@ -455,8 +455,8 @@ class ParamClient:
             if any(each.node.channel.answered.is_set() for each in chosen.values()):
                 for address, each in chosen.items():
                     is_likely = each in self.autopilots and each.autopilot in ("ardupilot", "px4")
-                    is_other = expects_extended(each.identity.vehicle_type, each.component)
-                    is_likely |= each.node.channel.answered.is_set() and not is_other
+                    has_extended = expects_extended(each.identity.vehicle_type, each.component)
+                    is_likely |= each.node.channel.answered.is_set() and not has_extended
                     if each.count is None and not is_likely:
                         scopes[address].cancel()
 

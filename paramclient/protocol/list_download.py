@@ -120,7 +120,7 @@ class _Download:
         self._inbox = inbox
         self._received: set[int] = set()  # indices of this list
         self._count: int | None = None
-        self._began = self._last = 0.0
+        self._began = 0.0
         self._begins_at = -math.inf  # at the latest, of a list that was requested repeatedly
         self._times: Counter[int] = Counter()  # that each index was received
         self._reached = -1  # the highest index
@@ -363,8 +363,7 @@ class _Download:
     def _take(self, message: Message) -> None:
         """Take one value."""
         assert isinstance(message, self.session.dialect.value)
-        index = message.param_index
-        self._last = anyio.current_time()
+        index, now = message.param_index, anyio.current_time()
         if message.param_id == HASH_CHECK:
             self.result.digest = Digest.of(message)
         if index not in self.table.names:
@@ -379,12 +378,12 @@ class _Download:
         self._times[index] += 1
         is_other = index in self._tried or self._times[index] > TIMES_MAX
         if index not in self._reading and (index > self._reached or not is_other):
-            self._listed_at = self._last
+            self._listed_at = now
             self._listed += 1
         if index in self._received:
             self.result.repeated += 1
         else:
-            self._gained_at = self._last
+            self._gained_at = now
         self._received.add(index)
         self._skipped.discard(index)
         if index > self._reached:

@@ -159,7 +159,7 @@ class Session:
         control: taken for the reads that decide this: the answer to another one would be taken for theirs.
         listing: the list that is downloaded in place of reads that are not answered.
         seeking: the reads for evidence of the encoding.
-        acknowledging: by name, sets that a value in another type than the parameter's may acknowledge yet.
+        acknowledging: by name, how many values in another type than the parameter's may acknowledge sets yet.
         observers: called with the parameters received and their number, while a fetch runs.
     """
 

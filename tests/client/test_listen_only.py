@@ -87,6 +87,7 @@ async def test_calls_that_send_are_refused_at_once() -> None:
     async with connected(channel, listen_only=True) as (client, component):
         calls: list[Callable[[], Awaitable[object]]] = [
             lambda: component.get("PARAM_01"),
+            lambda: component.get(0),
             lambda: component.set("PARAM_01", 1),
             lambda: component.read_file("@PARAM/param.pck"),
             lambda: component.fetch_all(refresh=True),

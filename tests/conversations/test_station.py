@@ -22,8 +22,8 @@ from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, V
 from paramclient.wire import messages
 from paramclient.wire.frames import build_frame
 from paramclient.wire.signing import Refusal, Signer, SigningKey, Verifier
-from tests.conversations.virtual import Puppet, converse, messages_in, talking, virtual_on_both
-from tests.shell import bits
+from tests.conversations.virtual import Puppet, converse, talking, virtual_on_both
+from tests.shell import bits, decoded
 
 PX4 = messages.Heartbeat(2, 12, system_status=4)
 ARDUPILOT = messages.Heartbeat(10, 3, system_status=4)
@@ -352,7 +352,7 @@ async def test_a_whole_session_in_mavlink_1(make: type[Vehicle]) -> None:
         conversation.sent.clear()
         assert bits((await fetch_all(session)).params) == bits(vehicle.params)
         assert {
-            data[0] for data in conversation.sent if not isinstance(messages_in(data)[0], messages.Heartbeat)
+            data[0] for data in conversation.sent if not isinstance(decoded(data)[0][1], messages.Heartbeat)
         } == {0xFE}
 
 

@@ -90,7 +90,7 @@ class Conversation:
 
     def sent_of(self, kind: type[T]) -> list[T]:
         """Return the sent messages of a kind."""
-        return [each for data in self.sent for each in messages_in(data) if isinstance(each, kind)]
+        return [each for data in self.sent for _, each in decoded(data) if isinstance(each, kind)]
 
     def hear(self, *messages: Message, system: int = 1, component: int = 1, peer: object = "sim") -> None:
         """Receive messages now, beside those of the endpoint."""
@@ -184,11 +184,6 @@ async def meanwhile(*calls: Awaitable[Any]) -> AsyncIterator[list[Any]]:
         yield outcomes
 
 
-def messages_in(data: bytes) -> list[Message]:
-    """Return the messages in a datagram."""
-    return [message for _, message in decoded(data)]
-
-
 def losing(number: int, is_lost: Callable[[Message], bool]) -> Passes:
     """Return a filter for a `Tap`, which loses the first messages of which a function says so."""
     left = [number]
@@ -232,7 +227,7 @@ class Puppet:
 
     def receive(self, data: bytes, now: float) -> None:
         """Answer the messages in a datagram."""
-        for message in messages_in(data):
+        for _, message in decoded(data):
             self.received.append(message)
             for each in self._answer(message):
                 self.say(each)
