@@ -156,7 +156,7 @@ class Watch:
         """Seconds until the next check without a sign of change."""
         if self.interval is not None:
             return self.interval or math.inf
-        return INTERVAL_DEFAULT if may_confirm(self.session) else math.inf
+        return INTERVAL_DEFAULT if self.policy is Policy.AUTO and may_confirm(self.session) else math.inf
 
     @property
     def _may_check(self) -> bool:
