@@ -192,7 +192,7 @@ class _Download:
             self.table.end_list()
         self.result.missing = missing = self._missing()
         if is_silent or not serves_reads:
-            first = min(self._received)
+            first = min(self._received, default=0)
             self.result.has_gap = any(has_loss or first < each < self._reached for each in missing)
         self.result.lost = len(self._lost & {*self._received, *missing})
 

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 import anyio
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from paramclient.errors import ParamClientError
@@ -108,6 +108,7 @@ any_message = st.one_of(
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(any_message, max_size=60), st.lists(st.binary(max_size=60), max_size=5))
+@example([messages.ParamExtValue("", b"", 0, *each) for each in ((2, 0), (2, 0), (1, 32768))], [])
 @virtual
 async def test_no_messages_and_no_bytes_raise_in_any_call(
     heard: list[messages.Message], noise: list[bytes]
