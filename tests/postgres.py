@@ -99,8 +99,7 @@ class Server:
         assert self._process is not None
         self._process.send_signal(signal.SIGSTOP)  # so that it starts no other one meanwhile
         pid = self._process.pid
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-        for each in (*map(int, children), pid):
+        for each in (*map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()), pid):
             os.kill(each, signal.SIGKILL)
         self._process.wait()
         self._process = None

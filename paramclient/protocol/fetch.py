@@ -25,7 +25,8 @@ FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
 """Where a fetch has the values from: the cache, the packed file (MAVFTP) or the list."""
 
 IDENTITY_TIME: Final = 1.5
-"""Seconds that a download waits to hear whether there is a file; PX4 and ArduPilot do not need it."""
+"""Seconds in which a fetch awaits the heartbeat that tells how a table is confirmed, and whether there is a
+file."""
 ROUNDS_MAX: Final = 3
 """Downloads, while the table changes during them."""
 NOT_REFRESHED: Final = "The values outside the hash were not read again, because the policy is hash-only."
@@ -194,10 +195,11 @@ class _Fetch:
         """Fetch, and return the result."""
         if self.policy is Policy.CACHE_ONLY:
             return self._unconfirmed()
+        wait = 0.0 if self.session.dialect.has_ack else IDENTITY_TIME
+        with self.session.channel.gate.until_closed(or_failed=True), anyio.move_on_after(wait):
+            await self.session.identification.heard()
         answer = Answer()
         if self.table.is_complete or self.policy is Policy.HASH_ONLY:
-            with self.session.channel.gate.until_closed(or_failed=True), anyio.move_on_after(IDENTITY_TIME):
-                await self.session.identification.heard()
             answer = await ask(self.session, refresh=refresh)
         elif self.session.identification.is_ardupilot and not refresh:
             is_cached = any(self._before[name].index is not None for name in self.table.unverified())
@@ -249,19 +251,17 @@ class _Fetch:
     async def _download(self) -> FetchSource:
         """Download the file, or the list where there is none."""
         session = self.session
-        if not self._ftp_is_silent and session.serves_file is not False and not session.dialect.has_ack:
-            with session.channel.gate.until_closed(or_failed=True), anyio.move_on_after(IDENTITY_TIME):
-                await session.identification.encoding_certain()
-            if session.identification.may_serve_file:
-                try:
-                    await download_file(session)
-                    self.table.complete()
+        has_file = session.serves_file is not False and session.identification.may_serve_file
+        if has_file and not self._ftp_is_silent and not session.dialect.has_ack:
+            try:
+                await download_file(session)
+                self.table.complete()
+                return "ftp"
+            except FileUnavailable as error:
+                if session.channel.is_silent(self._began):
                     return "ftp"
-                except FileUnavailable as error:
-                    if session.channel.is_silent(self._began):
-                        return "ftp"
-                    self.notes.append(f"Downloaded as a list: {error.reason}.")
-                    self._ftp_is_silent = error.is_silent
+                self.notes.append(f"Downloaded as a list: {error.reason}.")
+                self._ftp_is_silent = error.is_silent
         self.listed = await download_list(session)
         by_loss = session.channel.timing.attempts_for(SILENT_LOST) if self.listed.lost else 0
         if self._ftp_is_silent and not self.listed.missing and session.ftp_unanswered >= by_loss:

@@ -100,8 +100,7 @@ LONG_CALLS: dict[str, Call] = {
 @virtual_on_both
 async def test_closing_ends_a_call_of_another_task_at_once(call: str) -> None:
     client = await shell.a_client(PX4Vehicle(burst=1, period=0.05)).open()
-    component = await client.component()
-    async with meanwhile(LONG_CALLS[call](client, component)) as raised:
+    async with meanwhile(LONG_CALLS[call](client, await client.component())) as raised:
         await anyio.sleep(1.0)
         await client.aclose()
         closed_at = anyio.current_time()
@@ -295,6 +294,13 @@ async def test_fetch_all_waits_for_a_second_vehicle(delay: float) -> None:
         assert (await client.fetch_all()).results.keys() == {(1, 1), (2, 1)}
 
 
+@pytest.mark.parametrize(("serves", "delay"), [("list", 0.25), ("indices", 0.0)])
+async def test_fetch_all_waits_for_a_companion_that_answers_no_command(serves: str, delay: float) -> None:
+    companion = Partial(serves=[serves], component=2, heartbeat=messages.Heartbeat(0, 8, system_status=4))
+    async with shell.a_client(Air.symmetric([shell.generic(), companion], delay=delay)) as client:
+        assert (await client.fetch_all()).results.keys() == {(1, 1), (1, 2)}
+
+
 async def test_fetch_all_waits_for_a_px4_that_is_starting() -> None:
     starting = silent(system=2, autopilot=messages.MAV_AUTOPILOT_PX4)
     async with shell.a_client(Air([shell.generic(), starting])) as client:
@@ -326,7 +332,7 @@ async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:
         await client.component()
         tap.is_deaf = True
         fetch = asyncio.create_task(client.fetch_all())
-        await asyncio.sleep(6.0)
+        await asyncio.sleep(4.5)
         tap.is_deaf = False
         assert (await fetch).complete
 

@@ -102,10 +102,9 @@ def test_invalid_signing_settings_are_refused_at_once() -> None:
 async def test_a_clock_that_was_set_back_adopts_the_vehicles_timestamp(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    vehicle = signed_vehicle(signing_timestamp=NOW)
     for now in (NOW, NOW - 50 * UNITS_PER_SECOND):
         monkeypatch.setattr(signing, "timestamp_now", lambda now=now: now)
-        async with a_client(vehicle) as client:
+        async with a_client(signed_vehicle(signing_timestamp=NOW)) as client:
             assert (await (await client.component()).get("PARAM_04", timeout=2.0)).name == "PARAM_04"
 
 

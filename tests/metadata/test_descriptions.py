@@ -267,9 +267,8 @@ ENTITIES = [
 @pytest.mark.parametrize("text", ENTITIES, ids=["expansion", "file", "address"])
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
 def test_a_document_type_is_rejected(text: str, encoding: str) -> None:
-    content = text.encode(encoding)
     with pytest.raises(FileError, match="document type" if encoding == "utf-8" else "neither JSON nor XML"):
-        read_content(content, source="the file")
+        read_content(text.encode(encoding), source="the file")
 
 
 def test_a_description_in_another_encoding_is_read() -> None:

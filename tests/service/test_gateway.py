@@ -1037,8 +1037,7 @@ async def test_rule_10_what_is_for_an_autopilot_that_is_not_served_is_not_refuse
 @pytest.mark.parametrize("is_one_link", [False, True])
 async def test_rule_10_two_vehicles_with_one_id(is_one_link: bool, caplog: pytest.LogCaptureFixture) -> None:
     vehicles = [Tap(small_px4()), Tap(small_px4())]
-    links = [PeersLink(dict(enumerate(vehicles)))] if is_one_link else vehicles
-    async with gateway_over(*links) as served:
+    async with gateway_over(*[PeersLink(dict(enumerate(vehicles)))] if is_one_link else vehicles) as served:
         await served.synced()
         station = served.partner()
         with caplog.at_level(logging.WARNING):
