@@ -68,8 +68,10 @@ OFTEN_MAX: Final = 8
 """Values changed at once that may have moved by themselves: of more, somebody has changed them."""
 TOO_MANY: Final = "it differs, and a download is quicker than a search for the changes"
 OTHER: Final = "the vehicle has other parameters than the cached table, or changes them all the time"
-PROOFS_MAX: Final = 2
-"""Proofs: the table may change in the middle of one."""
+PROOFS_MAX: Final = 3
+"""Proofs: the table may change in the middle of one, and the vehicle may restart in the next."""
+RESTART_TIME: Final = 1.0
+"""Seconds that a vehicle's restart takes at least, after which other values may be in parts proven before."""
 REPEATS_MAX: Final = 3
 """Checksums of single values that are requested again, as these may just have moved."""
 PARTS_MIN: Final = 3
@@ -105,11 +107,11 @@ async def prove(session: Session) -> None:
     async with session.channel.ftp:
         try:
             for _ in range(PROOFS_MAX):
-                proof = _Proof(session, _rows(session.table))
-                await proof.run()
+                proof, began = _Proof(session, _rows(session.table)), anyio.current_time()
+                is_at_once = await proof.run() or anyio.current_time() - began < RESTART_TIME
                 if session.identification.vehicles != vehicles:
                     raise FileUnavailable("another vehicle has taken the address")
-                if proof.take_over():
+                if proof.take_over() and is_at_once:
                     return
         except FileTransferError as error:
             if error.code == FileErrorCode.FAIL_ERRNO and session.serves_checksum:
@@ -155,8 +157,8 @@ class _Proof:
         self._alone = self._always | passed | ({0} if is_slow else set())  # compared first; 0 shows the count
         self._fresh = set[int]() if is_slow else self._alone
 
-    async def run(self) -> None:
-        """Compare, and read what differs, until nothing does.
+    async def run(self) -> bool:
+        """Compare, and read what differs, until nothing does. Return whether one checksum proves all rows.
 
         Raises:
             TableDiffers: the tables are too different.
@@ -205,6 +207,7 @@ class _Proof:
             elif guesses:
                 await self._read(guesses)
                 suspects -= guesses.keys()
+        return whole in self._found
 
     def _named(self, names: re.Pattern[str]) -> set[int]:
         """Return the rows with such names, but for those with a value of 0."""

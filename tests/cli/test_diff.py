@@ -51,14 +51,9 @@ BEFORE: Content = {
     "F_CONFLICT": (1.5, REAL32, 0.0),
     "G_TYPE": (1, INT32, 1),
 }
-AFTER: Content = {
-    "A_SAME": (1, INT32, 1),
-    "B_FLOAT": (0.2, REAL32, 0.1),
-    "D_RIGHT": (6, INT32, 0),
-    "E_BOTH": (7, INT32, 0),
-    "F_CONFLICT": (2.5, REAL32, 0.0),
-    "G_TYPE": (1.0, REAL32, 1),
-}
+AFTER = BEFORE | {"B_FLOAT": (0.2, REAL32, 0.1), "D_RIGHT": (6, INT32, 0)}
+AFTER |= {"F_CONFLICT": (2.5, REAL32, 0.0), "G_TYPE": (1.0, REAL32, 1)}
+del AFTER["C_LEFT"]
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ from paramclient.wire.messages import (
     ParamValue,
     encode,
 )
-from tests.conversations.virtual import Conversation, converse, run, virtual_on_both
+from tests.conversations.virtual import Conversation, converse, meanwhile, run, virtual_on_both
 from tests.shell import Tap
 
 MOVED = ("INS_GYROFFS_X", "INS_GYR2OFFS_Z", "BARO1_GND_PRESS", "STAT_RUNTIME", "STAT_BOOTCNT")
@@ -471,18 +471,23 @@ async def test_a_value_makes_up_for_no_other_name_or_type(
 async def test_a_change_in_the_middle_of_a_proof_is_not_proven() -> None:
     vehicle = ArduPilotVehicle(live_period=0.0)
     async with cached_on(Air.symmetric([vehicle], delay=0.05), vehicle.params) as (conversation, node):
-        async with anyio.create_task_group() as tasks:
+        async with meanwhile(fetched(vehicle, node)) as ends:
+            await anyio.sleep(0.06)
+            vehicle.load({"EK2_ENABLE": 1})
+            value = ParamValue("ATC_RAT_RLL_P", struct.pack("<f", 0.25), ParamType.REAL32, 1434, NO_INDEX)
+            conversation.hear(value)
+        assert (ends[0].missing, len(ends[0].params)) == ((), 1434)
 
-            async def change() -> None:
-                await anyio.sleep(0.06)
-                vehicle.load({"EK2_ENABLE": 1})
-                value = struct.pack("<f", 0.25)
-                conversation.hear(ParamValue("ATC_RAT_RLL_P", value, ParamType.REAL32, 1434, NO_INDEX))
 
-            tasks.start_soon(change)
-            result = await fetched(vehicle, node)
-        assert not result.missing
-        assert len(result.params) == 1434
+async def test_a_restart_within_a_slow_proof_leaves_no_value_of_before() -> None:
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    cached = vehicle.params
+    vehicle.load({"ATC_RAT_RLL_P": 0.2512345})
+    async with cached_on(Air.symmetric([vehicle], delay=0.3), cached) as (_, node):
+        async with meanwhile(fetched(vehicle, node)) as ends:
+            await anyio.sleep(0.9)
+            vehicle.reboot()
+        assert (ends[0].source, ends[0].changed) == ("cache", ("ATC_RAT_RLL_P",))
 
 
 async def test_an_acknowledgement_as_real32_changes_no_type() -> None:
