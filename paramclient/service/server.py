@@ -272,7 +272,7 @@ def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
     app.add_middleware(guard, tokens=tokens)
     for router in (routes.public, routes.reading, routes.writing):
         app.include_router(router)
-    app.mount("/", StaticFiles(packages=[("paramclient.service", "page")], html=True))
+    app.router.default = StaticFiles(packages=[("paramclient.service", "page")], html=True)
     return app
 
 
