@@ -187,7 +187,7 @@ class _Download:
             await self._next_pass()
             left -= len(self._received) == before
         is_silent = self.channel.is_silent(self._began)
-        has_loss |= not (serves_reads or self._listed)  # the last pass has brought nothing
+        has_loss |= not (serves_reads or self._listed or count == 1)  # the last pass has brought nothing
         if not has_loss and not is_silent:
             self.table.end_list()
         self.result.missing = missing = self._missing()
