@@ -164,8 +164,7 @@ class CacheWriter:
             self._something_to_write.set()
             return
         for session in node.sessions:
-            is_extended = session is node.extended
-            load = partial(self.cache.load, identity.key, node.component, extended=is_extended)
+            load = partial(self.cache.load, identity.key, node.component, extended=session is node.extended)
             cached = await self.attempt(load)
             if vehicle.identification.identity.key != identity.key:
                 return  # another vehicle has taken the address meanwhile, and its table is loaded

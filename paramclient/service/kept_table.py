@@ -55,8 +55,8 @@ the radio's queue: an error would be wrong then. The first of them may be older 
 TAKE_OVER_TIME: Final = 10.0
 """Seconds after which a list that was asked before the vehicle was heard is not expected any more."""
 REMEMBERED_TIME: Final = 30.0
-"""Seconds for which a name that the vehicle does not have is remembered, and for which requests pass to a
-component that did not answer the gateway's own fetch."""
+"""Seconds for which is remembered that the vehicle does not have a name, or has not sent all of its list, and
+for which requests pass to a component that did not answer the gateway's own fetch."""
 UNKNOWN_NAMES_MAX: Final = 4_096
 """Names that are remembered as unknown, at most."""
 
@@ -194,6 +194,7 @@ class KeptTable(Stream[Change]):
         self._announce = announce
         self._list_at = lru_cache(1)(lambda state: whole_list(component.session))
         self._unserved_until = -math.inf
+        self._partial_until = -math.inf
         self._unknown: dict[Which, float] = {}
         self._reads = Pending[Which]()
         self._sets = Pending[SetKey]()
@@ -268,7 +269,10 @@ class KeptTable(Stream[Change]):
     def send_list(self, station: GroundStation) -> None:
         """Answer a request for the list: from the table, or as a fetch brings it."""
         self.check()
-        if values := self.list_if_current:
+        values = self.list_if_current
+        if values is None and anyio.current_time() < self._partial_until:
+            values = listed(self.session)
+        if values:
             self._stream(station, values, set())
         else:
             self._listing.setdefault(station, set())
@@ -324,7 +328,8 @@ class KeptTable(Stream[Change]):
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(self._send_progress)
                 try:
-                    await self.component.fetch_all()
+                    if (await self.component.fetch_all()).missing:
+                        self._partial_until = anyio.current_time() + REMEMBERED_TIME
                 except ParamClientError:
                     if not self.is_lost:
                         self._unserved_until = anyio.current_time() + REMEMBERED_TIME

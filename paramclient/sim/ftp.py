@@ -121,8 +121,7 @@ class FileServer:
     def receive(self, payload: bytes, sender: Address, now: float) -> None:
         """Queue a request."""
         if len(self._waiting) < QUEUE:
-            turn = PX4_TURN if self.is_px4 else LOOP
-            self._waiting.append((now + turn, Packet.unpack(payload), sender))
+            self._waiting.append((now + (PX4_TURN if self.is_px4 else LOOP), Packet.unpack(payload), sender))
 
     def next_deadline(self) -> float:
         """Return the time of the next work, or infinity."""

@@ -38,7 +38,6 @@ from tests.shell import Eventful
 ROOT = Path(__file__).parents[2]
 URL = "sim:custom"
 TIMEOUT = 60.0  # seconds after which a test fails; a passing test never waits that long
-ESCAPE = "\x1b"
 
 HASH = "cf579589"
 """Of the simulated PX4 vehicle's table, as the recordings of the real one have it."""
@@ -503,7 +502,7 @@ def test_help_has_examples(live_command: Command, arguments: Sequence[str]) -> N
     assert (helped.code, helped.err) == (0, "")
     assert helped.out.startswith(f"Usage: {' '.join(['paramclient', *arguments])} ")
     assert f"Examples:\n  {' '.join(['paramclient', *arguments])}" in helped.out
-    assert ESCAPE not in helped.out
+    assert "\x1b" not in helped.out
     if not arguments:
         assert "Exit codes: 0 done;" in helped.out
         assert live_command().out == helped.out

@@ -36,7 +36,6 @@ class Station(GenericVehicle):
             super().send(Heartbeat(6, 8))
 
 
-SPEAKS = "1/1 sends messages (the last one "
 CURE = "Check the link towards the vehicle, and whether the vehicle requires signed messages."
 
 
@@ -44,7 +43,7 @@ CURE = "Check the link towards the vehicle, and whether the vehicle requires sig
 def test_a_vehicle_that_speaks_and_does_not_answer(command: Command, put: Put, words: list[Any]) -> None:
     done = command(words[0], put(Deaf(table={"A": 1})), *words[1:])
     assert done.code == 3
-    assert SPEAKS in done.err, done.err
+    assert "1/1 sends messages (the last one " in done.err, done.err
     assert done.err.endswith(f"{CURE}\n")
 
 

@@ -57,7 +57,6 @@ CALLS: dict[str, Call] = {
     "fetch_all of everyone": lambda client, component: client.fetch_all(),
     "fetch_all of a system": lambda client, component: client.fetch_all(1),
 }
-EVERY_CALL = pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
 
 
 def seen(progress: object) -> None:
@@ -90,7 +89,7 @@ async def check_after(call: Call, client: ParamClient, component: Component) -> 
     assert is_idle(client)
 
 
-@EVERY_CALL
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
 @pytest.mark.parametrize("how", ["task", "scope"])
 async def test_cancelled_at_each_point(call: Call, how: str) -> None:
     loop = shell.simulated_time_loop()

@@ -448,12 +448,11 @@ async def test_the_timeout_is_that_of_the_whole_call() -> None:
 
 LOG = bytes(range(256)) * 200
 """A file of 51,200 bytes, which takes a second."""
-FILES = {"/APM/LOGS/1.BIN": LOG, "/APM/a.txt": b"hello", "/APM/empty": b""}
 
 
 def with_files(**options: Any) -> ArduPilotVehicle:
     vehicle = ArduPilotVehicle(live_period=0, **options)
-    vehicle.files.update(FILES)
+    vehicle.files.update({"/APM/LOGS/1.BIN": LOG, "/APM/a.txt": b"hello", "/APM/empty": b""})
     return vehicle
 
 

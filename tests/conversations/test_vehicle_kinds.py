@@ -24,8 +24,6 @@ from tests.shell import Eventful, Tap
 ARDUPILOT = messages.Heartbeat(2, 3, system_status=4)
 PX4 = messages.Heartbeat(2, 12, system_status=4)
 RADIO = messages.Heartbeat(49, 0, system_status=4)
-NO_AUTOPILOT = messages.Heartbeat(2, 8, system_status=4)
-ONBOARD_COMPUTER = messages.Heartbeat(18, 0, system_status=4)
 CAMERA = messages.Heartbeat(30, 0, system_status=4)
 
 PARTS = [
@@ -442,7 +440,7 @@ async def test_values_under_another_id_are_named_and_can_be_read() -> None:
 
 
 async def test_a_component_1_that_claims_no_autopilot_is_the_vehicle_where_no_other_is() -> None:
-    vehicle = Partial(heartbeat=NO_AUTOPILOT)
+    vehicle = Partial(heartbeat=messages.Heartbeat(2, 8, system_status=4))
     async with ParamClient(vehicle, cache=False) as client:
         assert (await client.component()).address == (1, 1)
         assert (await client.only_component(1)).address == (1, 1)
@@ -463,7 +461,7 @@ async def test_a_vehicle_with_system_id_0_is_told(heartbeat: messages.Heartbeat,
 @pytest.mark.parametrize(
     ("heartbeat", "component"),
     [
-        (ONBOARD_COMPUTER, 191),
+        (messages.Heartbeat(18, 0, system_status=4), 191),
         (CAMERA, 100),
         (messages.Heartbeat(26, 3, system_status=4), 1),
         (QUIET, 154),

@@ -568,6 +568,16 @@ async def test_rule_3_a_list_with_a_name_that_is_not_stored_is_the_vehicles() ->
         assert station.of(ParamValue) == answers_of(model(), ParamValue, LIST)
 
 
+async def test_rule_3_a_list_of_which_a_value_never_comes_is_not_fetched_for_each_station() -> None:
+    vehicle = Tap(small_px4(), down=lambda message: getattr(message, "param_index", None) != 5)
+    async with gateway_over(vehicle) as served:
+        await (await served.heard()).ask(LIST, seconds=10.0)
+        station, before = await served.heard(), len(vehicle.messages(messages.ParamRequestList))
+        await station.ask(LIST)
+        assert {each.param_index for each in station.of(messages.ParamValue)} == {*range(25)} - {5}
+        assert len(vehicle.messages(messages.ParamRequestList)) == before
+
+
 async def test_rule_3_cached_values_are_never_served(tmp_path: Path) -> None:
     cache = tmp_path / "cache.db"
     async with in_sync(small_px4(), cache=cache):
