@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from paramclient.model.values import ParamType
-from paramclient.sim import ArduPilotVehicle, PX4Vehicle
+from paramclient.sim import PX4Vehicle
 from tests.simulated_on_udp import flying
 from tests.test_docs import ROOT, run
 
@@ -61,22 +60,3 @@ def test_live_fails_with_check_where_a_value_is_wrong(bench: Callable[..., str])
         text = bench("live", link, "--kind", "px4", "--seeds", "1", "--row", "clean", "--check", code=1)
     assert "PX4, clean, run 0: 1 differ: MC_AIRMODE was 3, is 2" in text
     assert " missed |" in text
-
-
-def test_live_applies_values_in_groups_and_puts_everything_back(bench: Callable[..., str]) -> None:
-    switches = ("FENCE_ENABLE", "GRIP_ENABLE", "SCR_ENABLE", "FOLL_ENABLE")
-    vehicle = ArduPilotVehicle(
-        table=dict.fromkeys(switches, (ParamType.INT8, 0)),
-        groups={
-            switch: {f"{switch[:4]}_LIMIT{number}": (ParamType.REAL32, 5.0) for number in range(7)}
-            for switch in switches
-        },
-    )
-    before = vehicle.values
-    with flying(vehicle) as link:
-        text = bench("live", link, "--kind", "ardupilot", "--seeds", "2", "--row", "apply")
-    row = text.splitlines()[2]
-    assert re.match(r"\| ArduPilot, apply 30 values in 4 groups \| \d+\.\d\d \| \d+\.\d\d \|", row), text
-    assert vehicle.values == before
-    vehicle.set_param("GRIP_ENABLE", 1)
-    assert vehicle.values["GRIP_LIMIT0"] == 5.0  # what is hidden too
