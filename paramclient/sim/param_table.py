@@ -101,8 +101,7 @@ class Entry:
             default = float(self.row.value) if self.row.default is None else self.row.default
             one, two = struct.unpack("<2f", struct.pack("<2f", float(self.value), default))
             if not abs(one - two) < FLT_EPSILON:
-                whole = int(default) & (1 << 8 * kind.size) - 1
-                other = whole if kind.is_integer else bits_of(default, kind)
+                other = int(default) & (1 << 8 * kind.size) - 1 if kind.is_integer else bits_of(default, kind)
             self._packed = PackedParam(self.name, kind, self.bits, other)
         return self._packed
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable
 from functools import partial
 from random import Random
@@ -225,7 +226,8 @@ async def test_a_fetch_does_not_wait_for_another_file(is_cached: bool) -> None:
 
 
 async def test_integers_of_a_file_are_exact_and_keep_so_beside_rounded_messages() -> None:
-    vehicle, name = ArduPilotVehicle(table=[SimParam("A", ParamType.INT32, 5)]), "A"
+    unset = SimParam("B", ParamType.REAL32, math.nan)
+    vehicle, name = ArduPilotVehicle(table=[SimParam("A", ParamType.INT32, 5), unset]), "A"
     vehicle.set_param(name, 2**24 + 1)
     async with talking(vehicle) as (conversation, session):
         result = await fetch_all(session)
