@@ -163,16 +163,15 @@ async def run(
                 await one.store_state()
                 await one.write_and_verify()
     except ParamClientError as failure:
-        if not one.sent:
-            raise
         error = failure
     finally:
         claims.pop(component, None)
     waited = anyio.current_time() - began
-    if scope.cancelled_caught:
+    is_late = anyio.current_time() >= began + seconds_of(options.get("timeout"))
+    if scope.cancelled_caught or (is_late and isinstance(error, NoReply)):
         error = NoReply(f"the apply to {component.system}/{component.component}", attempts=0, waited=waited)
-        if not one.sent:
-            raise error
+    if error is not None and not one.sent:
+        raise error
     return one.result(error, waited)
 
 
