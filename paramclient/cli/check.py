@@ -158,7 +158,8 @@ class _Check:
         trips: list[float] = []
         with suppress(TimeoutError):  # also NoReply
             while len(trips) < ROUND_TRIP_COUNT and sum(trips) < MEASURE_TIMEOUT:
-                await anyio.sleep(self._component.node.channel.timing.slowest)  # for answers to repeats
+                # for answers to repeats
+                await anyio.sleep(self._deadline.left(self._component.node.channel.timing.slowest) or 0.0)
                 began = anyio.current_time()
                 with anyio.fail_after(self._deadline.left(MEASURE_TIMEOUT)):
                     await request_message(self._component.node.channel, messages.AutopilotVersion)
