@@ -27,7 +27,7 @@ from paramclient.protocol.channel import task_group
 from paramclient.protocol.ftp import BUSY, checksum, is_free
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode_entries, header
 from paramclient.protocol.reads import READS_PER_SLOT_ARDUPILOT, SLOT_ARDUPILOT, read
-from paramclient.protocol.session import FileUnavailable, Session
+from paramclient.protocol.session import UNANSWERED, FileUnavailable, Session
 from paramclient.protocol.table import Table
 
 CHECKED_READ_SIZE: Final = 64
@@ -122,7 +122,7 @@ async def prove(session: Session) -> None:
         except NoReply as error:
             session.ftp_unanswered += error.attempts
             is_silent = session.serves_checksum is None
-            raise FileUnavailable("MAVFTP did not answer", is_silent=is_silent) from None
+            raise FileUnavailable(UNANSWERED, is_silent=is_silent) from None
     raise TableDiffers(OTHER)
 
 

@@ -19,7 +19,7 @@ from paramclient.protocol.file_download import download_file
 from paramclient.protocol.ftp import SILENT_LOST
 from paramclient.protocol.list_download import ListResult, download_list
 from paramclient.protocol.reads import read_many
-from paramclient.protocol.session import FileUnavailable, Session
+from paramclient.protocol.session import UNANSWERED, FileUnavailable, Session
 
 FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
 """Where a fetch has the values from: the cache, the packed file (MAVFTP) or the list."""
@@ -229,7 +229,7 @@ class _Fetch:
             ):
                 break
             digest = None  # it was of the table before
-        if answer.is_other or (answer.reason and self.session.serves_checksum):
+        if answer.is_other or (answer.reason == UNANSWERED and self.session.serves_checksum):
             self._name_changes()
         return self._result(source)
 
@@ -239,11 +239,12 @@ class _Fetch:
         self._vehicles = identification.vehicles
         if self._vehicles != before:
             self.notes.append(REPLACED.format(identification.identity))
+            self._before.clear()
         return self._vehicles != before
 
     def _name_changes(self) -> None:
         """Take note of the values that are others than at the begin, without those that change themselves."""
-        changed = differing(self._before, self.table.params)
+        changed = differing(self._before, self.table.params) if self._before else ()
         self._changed = tuple(name for name in changed if not is_moving(name))
         if self._changed:
             self.notes.append(CHANGED.format(first_of(self._changed, SHOWN_MAX)))

@@ -12,7 +12,7 @@ from paramclient.protocol.channel import task_group
 from paramclient.protocol.ftp import BUSY, FTP_SILENT_TIME, FileCutOff, is_free, read_file
 from paramclient.protocol.param_pck import PACK_SIZE_MAX, PARAM_FILE, Pack, decode, decode_prefix, encode
 from paramclient.protocol.reads import read
-from paramclient.protocol.session import FileUnavailable, Session
+from paramclient.protocol.session import UNANSWERED, FileUnavailable, Session
 
 WITH_DEFAULTS: Final = "?withdefaults=1"
 """Requests the defaults too; a server that does not know it may report that there is no such file."""
@@ -53,10 +53,10 @@ async def download_file(session: Session) -> int:
             raise FileUnavailable(f"the parameter file was refused: {error.reason}") from None
         except FileCutOff as error:
             _store_beginning(session, error.prefix, requested_at)
-            raise FileUnavailable("MAVFTP did not answer") from None
+            raise FileUnavailable(UNANSWERED) from None
         except NoReply as error:
             session.ftp_unanswered += error.attempts
-            raise FileUnavailable("MAVFTP did not answer", is_silent=True) from None
+            raise FileUnavailable(UNANSWERED, is_silent=True) from None
         except PackError as error:
             reason = f"is not valid: {error}"
         else:

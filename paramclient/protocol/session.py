@@ -34,6 +34,8 @@ LATE_TIME: Final = 0.3
 queues the answer, and sends it up to 100 ms later; some links let datagrams overtake others."""
 REPLACED_MAX: Final = 16
 """Values of one parameter that are remembered meanwhile: it acknowledges its sets every 6 ms at most."""
+UNANSWERED: Final = "MAVFTP did not answer"
+"""The reason of a `FileUnavailable` that loss may explain."""
 
 
 class FileUnavailable(Exception):

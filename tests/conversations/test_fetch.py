@@ -136,6 +136,7 @@ async def test_another_vehicle_at_the_address_is_fetched_whole(
         result = await fetch_all(session)
         check_right(other, result)
         assert fetched_after is not None or result.notes[-1].startswith("Another vehicle has taken the")
+        assert result.changed == ()
 
 
 @pytest.mark.parametrize(("known_at", "source"), [(1.0, "ftp"), (2.5, "stream")])
