@@ -185,7 +185,7 @@ class _Download:
         while left and self._gaps() and not self.channel.is_silent(self._began):
             before = len(self._received)
             await self._next_pass()
-            left -= len(self._received) == before
+            left -= len(self._received & self.table.names.keys()) <= before
         is_silent = self.channel.is_silent(self._began)
         has_loss |= not (serves_reads or self._listed or count == 1)  # the last pass has brought nothing
         if not has_loss and not is_silent:

@@ -37,8 +37,9 @@ from paramclient.wire.messages import Message, ParamError, ParamExtAck, StatusTe
 
 SILENT_SETS_MAX: Final = 3
 """Sets without an acknowledgement, after which a read shows the value: some firmware acknowledges none."""
-ACKS_MAX: Final = 2
-"""Acknowledgements of one set: some firmware sends the old value first, and PX4 the new one twice."""
+ACKS_MAX: Final = 4
+"""Acknowledgements of one set: some firmware sends the old value first, and PX4 the new one twice; a link may
+double each."""
 SETS_MIN: Final = 5
 SETS_MAX: Final = 12
 SETS_TIME: Final = 5.0
@@ -314,6 +315,7 @@ class _Write:
             why = f"{channel} refused {self.name}: {ExtAckResult.name_of(answer.param_result)}"
             refused = kind(why, *channel.target, code=answer.param_result, name=self.name)
         elif isinstance(answer, Param) and answer.type == self.before.type:
+            del self.session.acknowledging[self.name]  # it acknowledges in this type
             return answer
         if not channel.is_silent(self._began):
             with suppress(NoReply):  # only a read shows a changed type, or an extended parameter's value
@@ -380,13 +382,9 @@ class _Write:
 
     def _is_converted(self, param: Param) -> bool:
         """Return whether the value is the wanted one as an ArduPilot converts it: 3000 of 3000.5."""
-        return (
-            isinstance(self.value, float)
-            and isinstance(param.type, ParamType)
-            and param.type.is_integer
-            and math.isfinite(self.value)
-            and param.value == int(self.value)
-        )
+        is_integer = isinstance(param.type, ParamType) and param.type.is_integer
+        is_finite = isinstance(self.value, float) and math.isfinite(self.value)
+        return is_integer and is_finite and param.value == int(self.value)
 
     def _result(self, param: Param) -> SetResult:
         actual = self.session.table.params.get(self.name, param)
@@ -466,20 +464,21 @@ async def _known(session: Session, name: str) -> Param:
 async def _seek_evidence(session: Session) -> None:
     """Read the first values of the list, until one shows the encoding or all had time to be answered.
 
-    Where no reads by index are answered, the whole list may show it.
+    Where none of these does, or no reads by index are answered, the whole list may show it.
     """
     channel, table = session.channel, session.table
-    if session.serves_reads.get(int) is False:
-        with suppress(NoReply):  # it has no list either
-            await session.listing.join(lambda: download_list(session))
-        return
-    with channel.inbox(session.dialect.value) as inbox:
-        for first in range(0, min(EVIDENCE_MAX, table.count or EVIDENCE_MAX), EVIDENCE_READS):
-            sent, seconds = anyio.current_time(), queue_time(session, EVIDENCE_READS)
-            for index in range(first, first + EVIDENCE_READS):
-                channel.send(session.dialect.request_read(channel.reads_from, index))
-            if await channel.wait_for(inbox, lambda message: table.evidence or None, sent, 0, seconds):
-                return
+    if session.serves_reads.get(int) is not False:
+        with channel.inbox(session.dialect.value) as inbox:
+            for first in range(0, min(EVIDENCE_MAX, table.count or EVIDENCE_MAX), EVIDENCE_READS):
+                sent, seconds = anyio.current_time(), queue_time(session, EVIDENCE_READS)
+                for index in range(first, first + EVIDENCE_READS):
+                    channel.send(session.dialect.request_read(channel.reads_from, index))
+                if await channel.wait_for(inbox, lambda message: table.evidence or None, sent, 0, seconds):
+                    return
+        if len(table.names) < EVIDENCE_READS:  # only names are read
+            return
+    with suppress(NoReply):  # it has no list either
+        await session.listing.join(lambda: download_list(session))
 
 
 def _check_finite(session: Session, name: str, value: Value, *, force: bool) -> None:

@@ -87,6 +87,22 @@ async def test_an_acknowledgement_in_another_type_changes_neither_the_type_nor_t
             assert changes == [("MODE", 4)]
 
 
+async def test_an_integer_is_not_written_in_the_type_of_a_repeated_acknowledgement() -> None:
+    for seed in range(12):
+        vehicle = Partial(ack_type=ParamType.REAL32)
+        air = Air.symmetric([vehicle], duplicate=0.5, reorder=0.3, delay=0.1, seed=seed)
+        async with talking(air) as (_, session):
+            await write(session, "MODE", 9)
+            assert vehicle.values["MODE"] == encode_value(9, ParamType.INT32, Encoding.BYTEWISE)
+
+
+async def test_a_value_in_another_type_after_a_set_is_taken() -> None:
+    async with talking(vehicle := Partial()) as (_, session):
+        await write(session, "MODE", 4)
+        vehicle.types["MODE"], vehicle.values["MODE"] = ParamType.REAL32, struct.pack("<f", 2.5)
+        assert (await fetch_all(session)).params["MODE"].value == 2.5
+
+
 FORTY = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
 COUNTS: dict[str, Callable[[int], int]] = {
     "right": lambda index: 40,
@@ -131,6 +147,13 @@ async def test_a_growing_count_is_complete_at_its_end_only(loss: float, serves: 
         async with talking(Air.symmetric([vehicle], loss=loss, seed=seed)) as (_, session):
             result = await fetch_all(session)
             assert not result.complete or len(result.params) == 40
+
+
+@pytest.mark.parametrize("changed", [lambda index: 40 + index % 2, lambda index: 40 - index])
+async def test_a_count_that_changes_within_a_list_ends_it(changed: Callable[[int], int]) -> None:
+    vehicle = Partial(FORTY, serves=("list",), count=changed)
+    async with talking(Air.symmetric([vehicle], rate=3_000.0)) as (_, session):
+        assert (await fetch_all(session)).params.keys() == FORTY.keys()
 
 
 @pytest.mark.parametrize("count", [9, 3_008, 65_535])
@@ -346,7 +369,8 @@ async def test_a_listed_value_is_taken_before_the_end(
 async def test_integers_in_another_encoding_are_told_and_not_written(
     heartbeat: messages.Heartbeat, capabilities: int | None, encoding: Encoding, name: str
 ) -> None:
-    table = {"ZERO": (0, ParamType.INT32), **dict.fromkeys("ABCDEFGH", (0.0, ParamType.REAL32)), **TABLE}
+    floats = [f"F{number}" for number in range(8 if name == "OFFSET" else 40)]
+    table = {"ZERO": (0, ParamType.INT32), **dict.fromkeys(floats, (0.0, ParamType.REAL32)), **TABLE}
     version = None if capabilities is None else messages.AutopilotVersion(capabilities, uid=7)
     vehicle = Partial(table, heartbeat=heartbeat, encoding=encoding, version=version)
     async with talking(vehicle) as (_, session):
