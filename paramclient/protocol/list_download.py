@@ -183,9 +183,8 @@ class _Download:
         has_loss = not serves_reads and any(0 < index < self._reached for index in self._lost)
         left = 0 if serves_reads or count == 1 else FRUITLESS_PASSES_MAX if has_loss else 1
         while left and self._gaps() and not self.channel.is_silent(self._began):
-            before = len(self._received)
             await self._next_pass()
-            left -= len(self._received & self.table.names.keys()) <= before
+            left -= self._gained_at < self._began
         is_silent = self.channel.is_silent(self._began)
         has_loss |= not (serves_reads or self._listed or count == 1)  # the last pass has brought nothing
         if not has_loss and not is_silent:
@@ -210,7 +209,7 @@ class _Download:
                 return
             self._lost.update(missing)
             await self._next_pass()
-            fruitless = fruitless + 1 if self._missing() == missing else 0
+            fruitless = fruitless + 1 if self._gained_at < self._began else 0
 
     async def _next_pass(self) -> None:
         """Request the list once more, where that is quicker than reads, and receive it."""
@@ -382,7 +381,7 @@ class _Download:
             self._listed += 1
         if index in self._received:
             self.result.repeated += 1
-        else:
+        elif self._times[index] <= TIMES_MAX:  # the count may change again and again
             self._gained_at = now
         self._received.add(index)
         self._skipped.discard(index)
