@@ -258,8 +258,7 @@ async def _opened(
                     raise
                 await anyio.sleep(BUSY_TIME)
         session = answer.session
-        size = int.from_bytes(answer.data[:4], "little") if len(answer.data) >= 4 else None
-        yield session, size
+        yield session, int.from_bytes(answer.data[:4], "little") if len(answer.data) >= 4 else None
     finally:
         if session is not None or is_requested:
             is_closed = False

@@ -364,8 +364,8 @@ class Table:
     # trust
 
     def doubt(self, *names: str) -> None:
-        """Mark values as cached, or all: the component was lost, or has rebooted."""
-        for name in names or self.params:
+        """Mark values as cached, or all: the component may have others by now."""
+        for name in self.params.keys() & (names or self.params):
             self.params[name] = self.params[name].with_trust(Trust.CACHED)
 
     def verify(self) -> None:

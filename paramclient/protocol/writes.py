@@ -21,6 +21,7 @@ from paramclient.errors import (
     ParamErrorCode,
     SetFailed,
     TypeMismatch,
+    UnknownParameter,
     UsageError,
     ValueNotApplied,
     ValueUnsupported,
@@ -116,8 +117,9 @@ async def write(
                 before = await _read_writable(session, name)
                 try:
                     result = await _Write(session, vehicles, before, value, report).run()
-                except (NoReply, LinkError, anyio.get_cancelled_exc_class()):
+                except (NoReply, LinkError, UnknownParameter, anyio.get_cancelled_exc_class()):
                     session.foreign_set(name, author, anyio.current_time())  # it may be acknowledged yet
+                    session.table.doubt(name)
                     raise
             if settle > 0:
                 report(result)
@@ -466,7 +468,7 @@ async def _seek_evidence(session: Session) -> None:
 
     Where none of these does, or no reads by index are answered, the whole list may show it.
     """
-    channel, table = session.channel, session.table
+    channel, table, began = session.channel, session.table, anyio.current_time()
     if session.serves_reads.get(int) is not False:
         with channel.inbox(session.dialect.value) as inbox:
             for first in range(0, min(EVIDENCE_MAX, table.count or EVIDENCE_MAX), EVIDENCE_READS):
@@ -475,7 +477,7 @@ async def _seek_evidence(session: Session) -> None:
                     channel.send(session.dialect.request_read(channel.reads_from, index))
                 if await channel.wait_for(inbox, lambda message: table.evidence or None, sent, 0, seconds):
                     return
-        if len(table.names) < EVIDENCE_READS:  # only names are read
+        if sum(moment >= began for moment in table.moments.values()) < EVIDENCE_READS:  # of few, or none
             return
     with suppress(NoReply):  # it has no list either
         await session.listing.join(lambda: download_list(session))

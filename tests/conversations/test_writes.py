@@ -311,14 +311,15 @@ async def test_silence_is_no_reply_within_7_s_and_a_cancelled_write_sends_no_mor
     for maker in (PX4Vehicle, ArduPilotVehicle):
         endpoint = Tap(maker())
         async with talking(endpoint) as (conversation, session):
-            name = "MC_ROLL_P" if maker is PX4Vehicle else "ATC_ANG_RLL_P"
-            await read(session, name)
+            axes = ("MC_ROLL_P", "MC_PITCH_P") if maker is PX4Vehicle else ("ATC_ANG_RLL_P", "ATC_ANG_PIT_P")
+            cancelled, name = [(await read(session, axis)).param_id for axis in axes]
             endpoint.silent_at = began = anyio.current_time()
             with anyio.move_on_after(1.0):
-                await write(session, name, 1.5)
+                await write(session, cancelled, 1.5)
             sent = len(conversation.sent_of(ParamSet))
             await anyio.sleep(0.5)
             assert len(conversation.sent_of(ParamSet)) == sent > 0
+            assert session.table.params[cancelled].trust is Trust.CACHED
             with pytest.raises(errors.NoReply, match=f"acknowledgement of {name} by 1/1"):
                 await write(session, name, 2.5)
             assert anyio.current_time() - began < 8.5
