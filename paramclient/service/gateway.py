@@ -87,8 +87,9 @@ class Gateway:
         """All connected stations."""
         return [station for endpoint in self.endpoints for station in endpoint.stations.values()]
 
-    def attach(self, client: ParamClient) -> None:
-        """Serve the vehicles of a client, which is not open yet. It is no ground station any more."""
+    def attach(self, client: ParamClient) -> ParamClient:
+        """Serve the vehicles of a client, which is not open yet, and return it. It is no ground station any
+        more."""
         station = client.core.station
         station.own_type = OWN_TYPE
         if station.own_address[0] == GROUND_STATION_SYSTEM:
@@ -96,6 +97,7 @@ class Gateway:
         link = VehicleLink(self, client)
         client.core.add_tap(link)
         client.core.link_task.accepts = link.accepts
+        return client
 
     async def open(self) -> None:
         """Open the endpoints.
@@ -169,7 +171,7 @@ class Gateway:
         served = [table for table, link in found.items() if self._serves(station, table, link)]
         autopilots = [table for table in found if table.source[1] == messages.AUTOPILOT_COMPONENT]
         systems = {table.source[0] for table in found}
-        if not served or (len(systems) > 1 and not isinstance(message, ListRequest)):
+        if not served or (len(systems) > 1 and isinstance(message, SetRequest | messages.FileTransfer)):
             if isinstance(message, ListRequest):
                 station.list_asked = (anyio.current_time(), address, extended, set())
             return not (found or message.target_system)

@@ -231,11 +231,15 @@ class Target:
             self.progress = None
             self.fetches += 1
             self.check()
+        await self._describe()
+        return result
+
+    async def _describe(self) -> None:
+        """Load the metadata of this firmware, where the service has it."""
         store, identity = self.hub.metadata_store, self.component.identity
         if store is not None and self.described != identity and not self.component.is_extended:
             self.metadata = await anyio.to_thread.run_sync(store.known, identity, self.component.component)
             self.described = identity
-        return result
 
     async def fetch_complete(self) -> None:
         """Fetch the table of a component that was heard, again if that ends without all of it."""
@@ -276,6 +280,8 @@ class Target:
             ServiceError: 422, values are out of range.
             ParamClientError: the component did not send the type of an extended parameter.
         """
+        await wait_for_identity(self.component)
+        await self._describe()
         found: dict[str, Value] = {}
         faults: dict[str, str] = {}
         for name, each in given.items():
@@ -392,10 +398,7 @@ class Hub:
             self.links[name] = ServiceLink(name, make)
 
     def _new_client(self, link: LinkChoice, **options: Any) -> ParamClient:
-        client = ParamClient(link, **options)
-        if self.gateway.endpoints:
-            self.gateway.attach(client)
-        return client
+        return self.gateway.attach(ParamClient(link, **options))
 
     async def __aenter__(self) -> Hub:
         await self.gateway.open()

@@ -161,11 +161,12 @@ def known_param(session: Session, name: str | None) -> Param | None:
 def is_decoded(session: Session) -> bool:
     """Whether values are those that the vehicle has sent: in another encoding, the bytes are not theirs.
 
-    A heartbeat that says so may be late, and the values themselves show it before.
+    A heartbeat that says so may be late, and the values themselves show it before; a file does not.
     """
-    return session.dialect.has_ack or (
-        session.identification.is_encoding_certain and not session.encoding_doubt
-    )
+    identification = session.identification
+    is_shown = identification.autopilot is not None or bool(session.table.evidence)
+    is_certain = is_shown and identification.is_encoding_certain and not session.encoding_doubt
+    return session.dialect.has_ack or is_certain
 
 
 class KeptTable(Stream[Change]):
@@ -216,7 +217,8 @@ class KeptTable(Stream[Change]):
         node, now = self.component.node, anyio.current_time()
         doubt = node.identification.is_encoding_certain and not (is_decoded(self.session) or self.is_loading)
         is_usable = not (doubt or self.session.table.left_out or node.has_rival(now))
-        return is_usable and node.identification.has_parameters and now >= self._unserved_until
+        is_usable = is_usable and node.identification.has_parameters
+        return is_usable and (now >= self._unserved_until or self.state_key is not None)
 
     @property
     def is_loading(self) -> bool:
@@ -234,7 +236,7 @@ class KeptTable(Stream[Change]):
         table, component = self.session.table, self.component
         if component.sync_state is not SyncState.SYNCED:
             return None
-        return (self.changes, table.count, component.watch.confirmed_at, table.hash)
+        return (self.changes, table.count, component.watch.confirmed_at, table.hash, len(table.unverified()))
 
     @property
     def list_if_current(self) -> list[ReportedValue] | None:
@@ -261,7 +263,7 @@ class KeptTable(Stream[Change]):
     def push(self, item: Change) -> None:
         """Take a change, and announce it unless it is a first value."""
         self.changes += 1
-        if item.new is not None and item.kind != "first":
+        if item.new is not None and item.kind != "first" and is_decoded(self.session):
             self._announce(self, value_of(self.session, item.new))
 
     # lists
@@ -334,6 +336,9 @@ class KeptTable(Stream[Change]):
                     if not self.is_lost:
                         self._unserved_until = anyio.current_time() + REMEMBERED_TIME
                 tasks.cancel_scope.cancel()
+            with anyio.move_on_after(READ_TIMEOUT):
+                while not is_decoded(self.session):  # noqa: ASYNC110 - no event for doubt
+                    await anyio.sleep(PROGRESS_INTERVAL)
             self._send_known()
         finally:
             self._loaded = None
@@ -393,8 +398,7 @@ class KeptTable(Stream[Change]):
 
     async def _read(self, which: Which, turns: anyio.CapacityLimiter) -> None:
         try:
-            with anyio.move_on_after(READ_TIMEOUT):
-                self._say(self._reads[which], await self._find(which, turns))
+            self._say(self._reads[which], await self._find(which, turns))
         except (errors.UnknownParameter, errors.Refused) as error:
             if len(self._unknown) >= UNKNOWN_NAMES_MAX:
                 self._unknown.clear()
@@ -456,12 +460,8 @@ class KeptTable(Stream[Change]):
             askers = self._sets.end(key)
         if code:
             self._reject(askers, key, code)
-        name = self.session.spelled(key[0])
-        if code == ParamErrorCode.COMPONENT_NOT_FOUND and known_param(self.session, name):
-            self.session.table.doubt(name)  # it may have the new value
-            self.changes += 1
-            await read_again(self.session, name, anyio.current_time())
-            self.changes += 1  # also if it has the old one
+        if code == ParamErrorCode.COMPONENT_NOT_FOUND:  # it may have the new value
+            await read_again(self.session, self.session.spelled(key[0]), anyio.current_time())
 
     async def _wait_longer(self, key: SetKey, scope: anyio.CancelScope) -> None:
         """Pass it on that a component works on a set of an extended parameter, and wait for its end then."""
@@ -493,8 +493,7 @@ class KeptTable(Stream[Change]):
         if number != known and (is_extended or session.table.encoding is not Encoding.C_CAST):
             return ParamErrorCode.TYPE_MISMATCH
         value = session.dialect.param(name, raw, known, None, session.table.encoding).settable
-        result = await self.component.set(name, value, author=author)
-        done = value_of(session, result.param)
+        done = value_of(session, (await self.component.set(name, value, author=author)).param)
         if is_extended:
             self._say(askers, messages.ParamExtAck(given, done.raw, number, ExtAckResult.ACCEPTED))
         else:

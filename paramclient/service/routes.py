@@ -234,7 +234,7 @@ System = Annotated[int, Path(ge=1, le=255)]
 ComponentId = Annotated[int, Path(ge=0, le=255)]
 LinkName = Annotated[str | None, Query(max_length=200, description="The link, if several have the ids.")]
 At = Annotated[Moment | None, Query(description="An earlier state: a snapshot's number, or a time.")]
-Names = Annotated[list[str] | None, Query(max_length=64, description="Names, or patterns such as MC_*.")]
+Names = Annotated[list[Pattern] | None, Query(max_length=64, description="Names, or patterns such as MC_*.")]
 Ext = Annotated[bool, Query(description="The extended parameters (PARAM_EXT_*).")]
 
 
@@ -444,9 +444,8 @@ async def _wanted(target: Target, body: PlanRequest) -> ParamSet:
     elif body.at is not None:
         found = await target.state_at(body.at)
     else:
-        values = await target.values(body.values or {})
-        found = ParamSet(values, is_extended=target.component.is_extended)
-    return found if body.only is None else found.only(body.only)
+        found = ParamSet(await target.values(body.values or {}), is_extended=target.component.is_extended)
+    return found if body.only is None else await anyio.to_thread.run_sync(found.only, body.only)
 
 
 def _context(author: str, target: Target) -> dict[str, Any]:

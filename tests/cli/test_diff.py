@@ -210,10 +210,8 @@ def test_two_links_are_compared(command: Command, monkeypatch: pytest.MonkeyPatc
         return ParamClient(SimLink(vehicles.pop(url), url), **options)  # each link is opened once
 
     monkeypatch.setattr(cli_session, "ParamClient", client)
-    vehicles = {
-        "tcp:one:1": GenericVehicle({"A": 1, "B": 2}),
-        "tcp:two:1": GenericVehicle({"A": 1, "B": 3}, system=7),
-    }
+    one, two = GenericVehicle({"A": 1, "B": 2}), GenericVehicle({"A": 1, "B": 3}, system=7)
+    vehicles = {"tcp:one:1": one, "tcp:two:1": two}
     outcome = command("diff", "tcp:one:1", "tcp:two:1", "--base", "tcp:one:1", "--json")
     assert (outcome.code, outcome.err) == (1, "")
     [(name, entry)] = outcome.json["params"].items()

@@ -251,7 +251,8 @@ async def test_odd_addresses_and_queries_are_problems() -> None:
         for address in (
             *(f"/api/vehicles/{each}/params" for each in ids),
             *(f"{V}/params?at={each}" for each in ("0", "9" * 5_000, "2026-11-20T14:00", "yesterday")),
-            *(f"{V}/params?link={'x' * 201}", f"{V}/params?ext=perhaps", f"{V}/file?format=exe"),
+            *(f"{V}/params?{each}" for each in (f"link={'x' * 201}", f"names={'[' * 65}", "ext=perhaps")),
+            f"{V}/file?format=exe",
             *(f"{V}/history?{each}" for each in ("limit=0", f"name={'N' * 17}", "since=yesterday")),
         ):
             problem(await browser.get(address), 422, "invalid-request")

@@ -561,6 +561,14 @@ async def test_rule_3_no_value_is_served_or_set_in_doubt(autopilot: int, kind: s
         assert {(each.raw, each.param_index) for each in station.of(ParamValue)} == {(raw, 0), (raw, 1)}
 
 
+async def test_rule_3_no_integer_is_served_while_nothing_tells_its_encoding() -> None:
+    copter = ArduPilotVehicle(table={"WHOLE": 5}, telemetry=4)
+    vehicle = Tap(copter, down=lambda message: not isinstance(message, messages.Heartbeat))
+    async with gateway_over(vehicle) as served:
+        await (station := await served.heard()).ask(LIST, seconds=8.0)
+        assert set(by_name(station).values()) <= {struct.pack("<f", 5)}
+
+
 async def test_rule_3_a_list_with_a_name_that_is_not_stored_is_the_vehicles() -> None:
     model = partial(generic, table={"A": 1.0, "B,": 2.0})
     async with in_sync(model()) as (_, _, station):
@@ -1029,6 +1037,14 @@ async def test_rule_10_what_is_asked_of_all_components() -> None:
         await station.ask(ParamRequestRead(1, 0, "TILT", -1), write, seconds=1.0)
         assert by_name(station) == {"TILT": struct.pack("<f", 1), "PARAM_01": struct.pack("<i", 9)}
         assert requested(vehicle) == [replace(write, target_component=1)]
+
+
+async def test_rule_10_a_read_for_whichever_vehicle_is_answered_from_each_table() -> None:
+    async with gateway_over(Air([small_px4(), small_px4(system=2)])) as served:
+        await served.clients[0].fetch_all()
+        station = await served.heard()
+        await station.ask(ParamRequestRead(0, 0, "PARAM_01", -1))
+        assert {each.system for each in station.frames if each.message_id == 22} == {1, 2}
 
 
 async def test_rule_10_what_is_for_an_autopilot_that_is_not_served_is_not_refused_by_another_one() -> None:

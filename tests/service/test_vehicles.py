@@ -16,6 +16,7 @@ from paramclient.links import SimLink
 from paramclient.model.values import ParamType
 from paramclient.sim import ArduPilotVehicle, Camera, PX4Vehicle
 from paramclient.sim.px4 import METADATA_FILE
+from paramclient.wire import messages
 from tests.recordings import DATA
 from tests.service.hub import V, browsing, problem, service, synced, until, value
 from tests.service.test_events import events
@@ -175,12 +176,16 @@ async def test_fetches_at_one_time_share_a_download_and_tell_their_progress() ->
 async def test_a_vehicle_that_is_lost_answers_no_request_with_a_problem() -> None:
     tap = Tap(generic())
     async with browsing(tap) as browser:
-        tap.is_mute = tap.is_deaf = True
+        tap.is_mute = True
+        problem(await browser.put(f"{V}/params/PARAM_05", json={"value": 55}), 504, "no-reply")
+        assert (await browser.get(f"{V}/params/PARAM_05")).json()["trust"] == "cached"  # it may have been set
+        tap.is_deaf = True
         problem(await browser.get(f"{V}/params/PARAM_04?live=true"), 504, "no-reply")
         await until(browser, V, lambda found: found["state"] == "lost")
         assert value(await browser.get(f"{V}/params/PARAM_04")) == VALUES["PARAM_04"]
         tap.is_mute = tap.is_deaf = False
         await synced(browser)
+        assert {each.type for each in tap.messages(messages.Heartbeat)} == {18}, "it is no ground station"
 
 
 async def test_two_vehicles_under_one_address_are_not_written() -> None:
