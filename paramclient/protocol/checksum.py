@@ -261,8 +261,7 @@ class _Proof:
         moments, now = self._session.table.moments, anyio.current_time()
         if len(place) == 1:
             for at, bits in self._explanations(place, difference):
-                passed = now - moments.get(self._rows[at].name, now)
-                if _has_just_moved(self._rows[at], bits, passed):
+                if _has_just_moved(self._rows[at], bits, now - moments.get(self._rows[at].name, now)):
                     yield at, bits
 
     def _guess(self, place: range, difference: int) -> dict[int, int]:

@@ -314,8 +314,7 @@ def result_of(
     channel, table, listed = session.channel, session.table, listed or ListResult()
     cached, missing = table.unverified(began), {*table.missing(), *listed.missing}
     if policy is Policy.AUTO:
-        indices = (table.params[name].index for name in cached)
-        missing |= {index for index in indices if index is not None}
+        missing |= {index for name in cached if (index := table.params[name].index) is not None}
     return FetchResult(
         channel.system,
         channel.component,

@@ -52,7 +52,7 @@ async def download_file(session: Session) -> int:
                 session.serves_file = False  # else another station has closed it
             raise FileUnavailable(f"the parameter file was refused: {error.reason}") from None
         except FileCutOff as error:
-            _store_beginning(session, error.prefix, requested_at)
+            _store_beginning(session, error.prefix, requested_at, session.table.count)
             raise FileUnavailable(UNANSWERED) from None
         except NoReply as error:
             session.ftp_unanswered += error.attempts
@@ -107,7 +107,7 @@ async def _read(session: Session, path: str, requested_at: float) -> tuple[bytes
 
     def begun(head: bytes) -> None:
         nonlocal total
-        total = _store_beginning(session, head, requested_at) or total  # others have first values then
+        total = _store_beginning(session, head, requested_at, None) or total  # others have first values
         session.serves_file = True
         if known not in (None, total):
             tasks.start_soon(read_count)
@@ -124,13 +124,16 @@ async def _read(session: Session, path: str, requested_at: float) -> tuple[bytes
     return data, count
 
 
-def _store_beginning(session: Session, prefix: bytes, requested_at: float) -> int | None:
-    """Store the whole entries at the beginning of a file, and return the number of all parameters in it."""
+def _store_beginning(session: Session, prefix: bytes, requested_at: float, count: int | None) -> int | None:
+    """Store the whole entries at the beginning of a file, and return the number of all parameters in it.
+
+    A table with another count than `count` keeps its values: the file may be damaged.
+    """
     try:
         pack, number = decode_prefix(prefix)
     except PackError:
         return None
-    if pack.entries and number == pack.total and session.table.count in (None, number):
+    if pack.entries and number == pack.total and session.table.count == count in (None, number):
         _store(session, pack, requested_at)
     return pack.total
 

@@ -214,9 +214,11 @@ class Session:
             sequence: of its frame: a lower one than that of the known value was overtaken.
         """
         name, spelled = message.param_id, self.spelled(message.param_id)
-        is_listed = message.param_index != NO_INDEX and spelled not in self.table.params
-        if name != spelled and self.identification.is_ardupilot and not is_listed:
-            name, message = spelled, message._replace(param_id=spelled)
+        if name != spelled and self.identification.is_ardupilot:
+            if spelled in self.table.params:
+                name, message = spelled, message._replace(param_id=spelled)
+            elif message.param_index == NO_INDEX and (self.dialect.value, name) not in self.channel.inboxes:
+                return None  # in the case of another station's request: the vehicle may have it in capitals
         message = self.typed(message)
         _, raw, number, _, _ = message
         table, replaced, is_sent = self.table, self.replaced.get(name), self.sent.get(name) == raw

@@ -287,12 +287,11 @@ class Station:
         return False
 
     def _take_foreign_set(self, message: ParamSet | ParamExtSet, frame: Frame, now: float) -> None:
-        author = f"station {frame.system}/{frame.component}"
         for node in self.nodes.values():
             ids = (node.component, messages.COMP_ID_ALL)
             if message.target_system == node.system and message.target_component in ids:
                 session = node.plain if isinstance(message, ParamSet) else node.extended
-                session.foreign_set(message.param_id, author, now)
+                session.foreign_set(message.param_id, f"station {frame.system}/{frame.component}", now)
 
     def _add(self, address: Address, peer: Peer, now: float) -> Node:
         node: Node

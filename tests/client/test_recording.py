@@ -54,7 +54,6 @@ def recorded(path: Path) -> list[messages.Message]:
 
 
 FRAMES = [frame(number) for number in range(5)]
-SIZE = 8 + len(FRAMES[0])
 
 
 @pytest.mark.parametrize("size", [1, 7, 64, 4096])
@@ -65,7 +64,7 @@ def test_damage_costs_one_frame_whatever_the_blocks(
     monkeypatch.setattr("paramclient.links.tlog.BLOCK_SIZE", size)
     data = bytearray(log_of(*FRAMES))
     assert [each.data for each in records(bytes(data))] == FRAMES
-    data[SIZE * place + 1] ^= 0x01  # the time, by nine years
+    data[(8 + len(FRAMES[0])) * place + 1] ^= 0x01  # the time, by nine years
     found = records(bytes(data))
     assert [each.data for each in found] == FRAMES[:place] + FRAMES[place + 1 :]
     assert all(each.at < NOW + 5 for each in found)

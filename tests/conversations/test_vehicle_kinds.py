@@ -197,7 +197,7 @@ async def test_the_first_value_of_a_list_that_is_lost_is_missing_and_no_other() 
 
 
 @pytest.mark.parametrize(("delay", "idle"), [(0.05, 0.0), (0.3, 0.0), (0.3, 3.0)])
-@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("first", [0, 1, messages.NO_INDEX])
 @pytest.mark.parametrize(
     "serves", [EVERYTHING, *((each, "sets", "commands") for each in ("names", "indices"))]
 )
@@ -205,12 +205,14 @@ async def test_names_in_lower_case_are_found_whatever_the_autopilot(
     serves: tuple[str, ...], first: int, delay: float, idle: float
 ) -> None:
     table = {"gain": (0.5, ParamType.REAL32), "mode": (5, ParamType.REAL32)}
-    vehicle = Partial(table, serves=serves, first=first, heartbeat=ARDUPILOT)
+    serves = serves if first < 2 else ("names", "sets")
+    vehicle = Partial(table, serves=serves, first=first, step=first < 2, heartbeat=ARDUPILOT)
     async with talking(Air.symmetric([vehicle], delay=delay)) as (_, session):
         await anyio.sleep(idle)
         with anyio.fail_after(15.0):
             result = await write(session, "mode", 4)
         assert (result.name, result.actual) == ("mode", 4)
+        assert session.table.params.keys() <= table.keys()
         if "list" in serves:
             await fetch_all(session)
             assert set(session.table.params) == {"mode", "gain"}

@@ -26,15 +26,12 @@ from tests.shell import Passes, SimulatedTimeLoop, decoded, outcome, simulated_t
 
 T = TypeVar("T")
 
-TIME_LIMIT = 300.0
-"""Virtual seconds after which a test hangs."""
-
 
 def run(test: Callable[..., Awaitable[T]], *arguments: Any, backend: str = "trio") -> T:
     """Run an async function in virtual time."""
 
     async def limited() -> T:
-        with anyio.fail_after(TIME_LIMIT):
+        with anyio.fail_after(300.0):  # virtual seconds after which a test hangs
             return await test(*arguments)
 
     if backend == "trio":

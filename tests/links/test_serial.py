@@ -28,8 +28,6 @@ pytestmark = pytest.mark.asyncio
 RATE = 40_000.0
 """Bytes per second in each direction. With 57600 baud (5,760 bytes per second), tests would take seconds."""
 
-TIOCGEXCL = 0x80045440  # Linux, asm-generic/ioctls.h; termios has no name for it
-
 
 @pytest.fixture
 def cable(tmp_path: Path) -> Iterator[Cable]:
@@ -122,7 +120,8 @@ async def test_an_open_port_is_exclusive_and_closing_frees_it(cable: Cable) -> N
         except OSError as error:
             return error.errno == errno.EBUSY
         try:  # privileged programs can open and inspect it
-            (flag,) = struct.unpack("i", fcntl.ioctl(file, TIOCGEXCL, bytes(4)))
+            # TIOCGEXCL of Linux, asm-generic/ioctls.h; termios has no name for it
+            (flag,) = struct.unpack("i", fcntl.ioctl(file, 0x80045440, bytes(4)))
         finally:
             os.close(file)
         return bool(flag)
