@@ -289,14 +289,15 @@ class Sessions(list[CommandSession]):
         codes = [report_all([error], f"{session.label}: ") for session, error in self.errors.items()]
         return max(codes, default=ExitCode.DONE)
 
-    def report_others(self) -> None:
+    def report_others(self, choosing: str = "--vehicle") -> None:
         """Report other vehicles of the link, if --vehicle did not choose the one that was used.
 
         For subcommands that only read: they use the first vehicle heard, which may be another one next time.
+        Some have no --vehicle, and another one chooses.
         """
         if others := self[0].others:
             used = f"{self[0].label} was used, the first vehicle heard"
-            report(f"{used}. Also on this link: {listed(others)}. --vehicle chooses one")
+            report(f"{used}. Also on this link: {listed(others)}. {choosing} chooses one")
 
 
 @asynccontextmanager

@@ -101,7 +101,7 @@ async def sets_of(
         options = replace(options, cache=None, no_cache=True)
     async with sessions(link, options, writes=writes) as opened:
         done = await opened.work(fetch)
-        opened.report_others()
+        opened.report_others("fetch --vehicle")
     opened.report_errors()
     return [*done.values()], bool(opened.errors)
 
