@@ -43,7 +43,7 @@ PROGRESS_INTERVAL: Final = 0.05
 FIRST_VALUE_TIME: Final = 1.0
 """Seconds without a value of a running fetch, after which one is requested beside it, and again: MAVSDK
 repeats its list after 2 s and gives up at the sixth."""
-LOADING_WAIT: Final = 1.0
+LOADING_WAIT: Final = 0.2
 """Seconds that a read by name waits for a fetch to bring the value before the vehicle is asked."""
 READ_TIMEOUT: Final = 3.0
 """Seconds for a value or a name that the table does not have."""
