@@ -106,8 +106,7 @@ class Presence:
         passed = 1000 * (now - at)
         possible = passed + 1000 * PATH_LATENCY_MAX
         is_back = boot_ms < before and boot_ms + BOOT_CLOCK_WRAP - before > possible  # without a wrap
-        is_late = boot_ms > possible or before + passed - boot_ms <= 1000 * REORDERING_TIME
-        if is_back and is_late:
+        if is_back and (boot_ms > possible or before + passed - boot_ms <= 1000 * REORDERING_TIME):
             return False
         is_known = now - self._rebooted_at < PATH_LATENCY_MAX
         if is_back:

@@ -75,6 +75,7 @@ class Watch:
         self._is_doubted = False
         self._before: Mapping[str, Param] = {}  # the table at the first sign of change
         self._is_due = False  # a sign of change was seen since the last check began
+        self._is_asked = False  # somebody wants to know
         self._signal = anyio.Event()
         self._holds = 0
 
@@ -98,7 +99,7 @@ class Watch:
         """Check soon whether the table is current, if the vehicle confirms tables and did not so recently."""
         is_old = anyio.current_time() - self.confirmed_at > older_than
         if is_old and self._is_fetched and may_confirm(self.session):
-            self._is_due = True
+            self._is_due = self._is_asked = True
             self._signal.set()
 
     def unconfirmed(self) -> None:
@@ -161,10 +162,11 @@ class Watch:
     @property
     def _may_check(self) -> bool:
         is_allowed = self.policy is Policy.AUTO and self._is_fetched and not self.presence.is_lost
-        is_armed = bool((self.presence.base_mode or 0) & MAV_MODE_FLAG_SAFETY_ARMED)
+        is_armed = (self.presence.base_mode or 0) & MAV_MODE_FLAG_SAFETY_ARMED
+        is_wanted = self._is_doubted or self._is_asked or not is_armed
         session = self.session
         is_busy = session.fetching.is_running or session.channel.ftp.locked() or bool(session.writing)
-        return is_allowed and not is_busy and not self._holds and (self._is_doubted or not is_armed)
+        return is_allowed and is_wanted and not is_busy and not self._holds
 
     async def _check(self) -> None:
         """Ask whether the table is current, and fetch it where the vehicle does not say so."""
@@ -184,7 +186,7 @@ class Watch:
         if answer.digest is not None:
             old = anyio.current_time() - OUTSIDE_AGE
             await read_many(session, [name for name in table.volatile if table.moments.get(name, old) < old])
-        self._is_doubted = False
+        self._is_doubted = self._is_asked = False
         self.confirmed_at = anyio.current_time()
         changed = differing(before, table.params)
         if was_doubted or changed:

@@ -509,20 +509,20 @@ async def test_rule_3_no_list_is_requested_beside_a_file_that_fills_the_radio(se
 
 
 async def test_rule_3_an_old_proof_is_renewed_behind_the_answer_and_differences_are_announced() -> None:
-    model = small_px4()
-    async with in_sync(model, watch_interval=0) as (_, vehicle, station):
-        await station.ask(GCS, seconds=6.0)
-        model.load({"PARAM_01": 77})  # announces nothing
-        vehicle.received.clear()
-        await station.ask(LIST, seconds=0.3)
-        assert by_name(station)["PARAM_01"] == struct.pack("<i", 1)
-        assert not requested(vehicle)
-        await anyio.sleep(5.0)
-        assert by_name(station)["PARAM_01"] == struct.pack("<i", 77)
-        vehicle.received.clear()
-        await station.ask(LIST, seconds=1.0)
-        assert by_name(station)["PARAM_01"] == struct.pack("<i", 77)
-        assert not requested(vehicle)  # the proof is young
+    for model in (small_px4(), small_px4(armed=True)):
+        async with in_sync(model, watch_interval=0) as (_, vehicle, station):
+            await station.ask(GCS, seconds=6.0)
+            model.load({"PARAM_01": 77})  # announces nothing
+            vehicle.received.clear()
+            await station.ask(LIST, seconds=0.3)
+            assert by_name(station)["PARAM_01"] == struct.pack("<i", 1)
+            assert not requested(vehicle)
+            await anyio.sleep(5.0)
+            assert by_name(station)["PARAM_01"] == struct.pack("<i", 77)
+            vehicle.received.clear()
+            await station.ask(LIST, seconds=1.0)
+            assert by_name(station)["PARAM_01"] == struct.pack("<i", 77)
+            assert not requested(vehicle)  # the proof is young
 
 
 async def test_rule_3_the_hash_is_answered_in_under_a_second_before_the_table_is() -> None:
