@@ -44,7 +44,7 @@ _ADDRESS: Final = re.compile(r"(?:\[([0-9a-fA-F:.]+)\]|([^:\s]+))(?::([0-9]{1,5}
 CONNECTIONS_MAX: Final = 200
 """Maximum number of connections, and of requests; further ones get the status 503."""
 IDLE_TIMEOUT: Final = 30
-"""Seconds after which an idle connection is closed."""
+"""Seconds after a response in which a connection without a request is closed."""
 SHUTDOWN_TIMEOUT: Final = 1
 """Seconds for responses in progress at shutdown; their connections are then closed."""
 
