@@ -171,7 +171,7 @@ class Watch:
     async def _check(self) -> None:
         """Ask whether the table is current, and fetch it where the vehicle does not say so."""
         session, table = self.session, self.session.table
-        was_doubted = self._is_doubted
+        was_doubted, self._is_asked = self._is_doubted, False
         before = self._before if was_doubted else dict(table.params)
         answer = await ask(session)
         may_fetch = was_doubted or answer.is_other or (self.interval is not None and not may_confirm(session))
@@ -186,7 +186,7 @@ class Watch:
         if answer.digest is not None:
             old = anyio.current_time() - OUTSIDE_AGE
             await read_many(session, [name for name in table.volatile if table.moments.get(name, old) < old])
-        self._is_doubted = self._is_asked = False
+        self._is_doubted = False
         self.confirmed_at = anyio.current_time()
         changed = differing(before, table.params)
         if was_doubted or changed:

@@ -446,11 +446,11 @@ async def _read_writable(session: Session, name: str) -> Param:
     if session.channel.is_lost:
         raise NoReply(f"the encoding of {session.channel}", attempts=0, waited=anyio.current_time() - began)
     param = await _known(session, name)
-    is_integer = isinstance(param.type, ParamType) and param.type.is_integer
-    if is_integer and session.identification.chosen is None:
+    table = session.table
+    if isinstance(param.type, ParamType) and param.type.is_integer and session.identification.chosen is None:
         # 0 is the same in both, and files have no encoding; a whole list has shown all that there is.
-        is_all = session.table.is_complete and session.serves_reads.get(int) is False
-        if not (session.table.evidence or is_all):
+        is_seen = not session.serves_file and all(each.trust is Trust.LIVE for each in table.params.values())
+        if not (table.evidence or (table.is_complete and is_seen)):
             await session.seeking.join(lambda: _seek_evidence(session))
         if doubt := session.encoding_doubt:
             raise UsageError(f"{name} was not written. {doubt}")

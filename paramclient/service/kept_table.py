@@ -164,7 +164,7 @@ def is_decoded(session: Session) -> bool:
     A heartbeat that says so may be late, and the values themselves show it before; a file does not.
     """
     identification = session.identification
-    is_shown = identification.autopilot is not None or bool(session.table.evidence)
+    is_shown = not session.serves_file or identification.autopilot is not None or bool(session.table.evidence)
     is_certain = is_shown and identification.is_encoding_certain and not session.encoding_doubt
     return session.dialect.has_ack or is_certain
 
@@ -271,10 +271,8 @@ class KeptTable(Stream[Change]):
     def send_list(self, station: GroundStation) -> None:
         """Answer a request for the list: from the table, or as a fetch brings it."""
         self.check()
-        values = self.list_if_current
-        if values is None and anyio.current_time() < self._partial_until:
-            values = listed(self.session)
-        if values:
+        is_partial = anyio.current_time() < self._partial_until and not self.is_loading
+        if values := self.list_if_current or (listed(self.session) if is_partial else []):
             self._stream(station, values, set())
         else:
             self._listing.setdefault(station, set())

@@ -263,6 +263,7 @@ def create_app(hub: Hub, *, tokens: Tokens | None = None) -> FastAPI:
         summary="MAVLink parameters of the vehicles on the links of this service",
         docs_url=None,  # its scripts would come from another site
         redoc_url=None,
+        redirect_slashes=False,
         responses=RESPONSES,
         exception_handlers=dict.fromkeys(ERRORS, respond),
     )
