@@ -208,8 +208,7 @@ def test_no_test_uses_a_private_name_of_the_package() -> None:
         name for module in MODULES for name in re.findall(r"\b_[a-z]\w+", ast.unparse(source_of(module)))
     }
     for path in sorted((ROOT / "tests").rglob("*.py")):
-        named = re.findall(r"['\"](_\w+)['\"]", path.read_text(encoding="utf-8"))
-        assert private.isdisjoint(named), path
+        assert private.isdisjoint(re.findall(r"['\"](_\w+)['\"]", path.read_text(encoding="utf-8"))), path
 
 
 def test_one_name_has_one_meaning() -> None:

@@ -181,10 +181,5 @@ def test_sessions_end_with_the_vehicles_table() -> None:
 @pytest.mark.parametrize("number", range(int(os.environ.get("SESSIONS", "200")) // 100))
 def test_a_hundred_sessions_of_a_seed(number: int) -> None:
     """`make soak` runs many of these. A failure is reported with the shortest session that fails."""
-
-    @seed(number)
-    class Seeded(Sessions):
-        pass
-
     chosen = settings(SETTINGS, max_examples=100, stateful_step_count=30, derandomize=False, database=None)
-    run_state_machine_as_test(Seeded, settings=chosen)
+    run_state_machine_as_test(seed(number)(type("Seeded", (Sessions,), {})), settings=chosen)

@@ -401,6 +401,13 @@ async def test_a_list_in_progress_may_still_show_another_encoding() -> None:
         assert (await write(session, "ZERO", 9)).status == "accepted"
 
 
+async def test_a_whole_list_is_requested_once_for_the_encoding() -> None:
+    async with talking(vehicle := Partial(dict.fromkeys("ABCDEFGHI", (0, ParamType.INT32)))) as (_, session):
+        await fetch_all(session)
+        await write(session, "A", 0)
+        assert vehicle.number_of(messages.ParamRequestList) == 1
+
+
 async def test_right_encodings_are_not_doubted() -> None:
     for heartbeat, encoding in ((ARDUPILOT, Encoding.C_CAST), (QUIET, Encoding.BYTEWISE)):
         large = 2**24 if encoding is Encoding.C_CAST else 2**31 - 1

@@ -1042,8 +1042,7 @@ async def test_rule_10_what_is_asked_of_all_components() -> None:
 async def test_rule_10_a_read_for_whichever_vehicle_is_answered_from_each_table() -> None:
     async with gateway_over(Air([small_px4(), small_px4(system=2)])) as served:
         await served.clients[0].fetch_all()
-        station = await served.heard()
-        await station.ask(ParamRequestRead(0, 0, "PARAM_01", -1))
+        await (station := await served.heard()).ask(ParamRequestRead(0, 0, "PARAM_01", -1))
         assert {each.system for each in station.frames if each.message_id == 22} == {1, 2}
 
 
