@@ -181,6 +181,7 @@ class _Download:
         await self._read_gaps()
         serves_reads, count = self.session.serves_reads.get(int), self._count
         has_loss = not serves_reads and any(0 < index < self._reached for index in self._lost)
+        # passes without a new value after which the count may be false: some may be lost
         left = 0 if serves_reads or count == 1 else FRUITLESS_PASSES_MAX if has_loss else 1
         while left and self._gaps() and not self.channel.is_silent(self._began):
             await self._next_pass()

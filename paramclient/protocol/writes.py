@@ -436,17 +436,16 @@ async def _read_writable(session: Session, name: str) -> Param:
         UsageError: the parameter is an integer, and the values contradict the encoding.
         NoReply: the component was lost meanwhile.
     """
-    param, began = await _known(session, name), anyio.current_time()
+    param, began, table = await _known(session, name), anyio.current_time(), session.table
     if session.dialect.has_ack:  # its values need no encoding
         return param
-    is_shown = param.type is ParamType.REAL32 or session.table.encoding in session.table.evidence
+    is_shown = param.type is ParamType.REAL32 or table.encoding in table.evidence
     if session.identification.autopilot is None or not is_shown:
         with session.channel.gate.until_closed(or_failed=True):
             await session.identification.encoding_certain()
     if session.channel.is_lost:
         raise NoReply(f"the encoding of {session.channel}", attempts=0, waited=anyio.current_time() - began)
     param = await _known(session, name)
-    table = session.table
     if isinstance(param.type, ParamType) and param.type.is_integer and session.identification.chosen is None:
         # 0 is the same in both, and files have no encoding; a whole list has shown all that there is.
         is_seen = not session.serves_file and all(each.trust is Trust.LIVE for each in table.params.values())

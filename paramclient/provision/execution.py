@@ -157,7 +157,7 @@ async def run(
     error: ParamClientError | None = None
     one = _Run(component, wanted, options, is_restore=is_restore)
     try:
-        with anyio.move_on_after(seconds_of(options.get("timeout")) + OUTCOMES_TIME) as scope:
+        with anyio.CancelScope(deadline=one.writes_until + OUTCOMES_TIME) as scope:
             await one.begin()
             with component.watch.held():  # a changed count starts no download besides those of the run
                 await one.store_state()
@@ -167,7 +167,7 @@ async def run(
     finally:
         claims.pop(component, None)
     waited = anyio.current_time() - began
-    is_late = anyio.current_time() >= began + seconds_of(options.get("timeout"))
+    is_late = anyio.current_time() >= one.writes_until
     if scope.cancelled_caught or (is_late and isinstance(error, NoReply)):
         error = NoReply(f"the apply to {component.system}/{component.component}", attempts=0, waited=waited)
     if error is not None and not one.sent:
@@ -181,6 +181,7 @@ class _Run:
     Attributes:
         component: the vehicle under its present system id.
         sent: parameters for which a PARAM_SET may have been sent, as the vehicle names them.
+        writes_until: when the timeout ends the writes.
     """
 
     def __init__(
@@ -192,7 +193,7 @@ class _Run:
         self.component, self.wanted, self.options = component, wanted, options
         self.is_restore, self._reboots_allowed = is_restore, options.get("reboot", False)
         self.sent: set[str] = set()
-        self._writes_until = anyio.current_time() + seconds_of(options.get("timeout"))
+        self.writes_until = anyio.current_time() + seconds_of(options.get("timeout"))
         self._before: ParamSet | None = None  # the state before the first write
         self._end_operation: Callable[[], None] | None = None  # records in the cache that the run has ended
         self._settled: dict[str, ApplyRow] = {}  # outcomes before the last read
@@ -395,7 +396,7 @@ class _Run:
                 force=self.options.get("force", False),
                 author=self.options.get("author"),
                 progress=lambda outcome: self._take(by_name[outcome.name], outcome),
-                timeout=max(self._writes_until - anyio.current_time(), 0.0),
+                timeout=max(self.writes_until - anyio.current_time(), 0.0),
             )
         except ParamClientError:
             self.sent &= before

@@ -216,9 +216,9 @@ class KeptTable(Stream[Change]):
         """Whether the gateway answers for the component; otherwise requests pass to it."""
         node, now = self.component.node, anyio.current_time()
         doubt = node.identification.is_encoding_certain and not (is_decoded(self.session) or self.is_loading)
-        is_usable = not (doubt or self.session.table.left_out or node.has_rival(now))
-        is_usable = is_usable and node.identification.has_parameters
-        return is_usable and (now >= self._unserved_until or self.state_key is not None)
+        is_unfit = doubt or self.session.table.left_out or node.has_rival(now)
+        is_fetched = now >= self._unserved_until or self.state_key is not None
+        return node.identification.has_parameters and is_fetched and not is_unfit
 
     @property
     def is_loading(self) -> bool:
@@ -335,13 +335,17 @@ class KeptTable(Stream[Change]):
                         self._unserved_until = anyio.current_time() + REMEMBERED_TIME
                 tasks.cancel_scope.cancel()
             with anyio.move_on_after(READ_TIMEOUT):
-                while not is_decoded(self.session):  # noqa: ASYNC110 - no event for doubt
-                    await anyio.sleep(PROGRESS_INTERVAL)
+                await self._decoded()
             self._send_known()
         finally:
             self._loaded = None
             self._listing.clear()
             loaded.set()
+
+    async def _decoded(self) -> None:
+        """Wait until the values are those that the vehicle has sent."""
+        while not is_decoded(self.session):  # noqa: ASYNC110 - no event for doubt
+            await anyio.sleep(PROGRESS_INTERVAL)
 
     async def _send_progress(self) -> None:
         """Send what the fetch has brought to the stations that wait; request one value if it brings none.
@@ -480,8 +484,7 @@ class KeptTable(Stream[Change]):
         session, is_extended = self.session, self.session.dialect.has_ack
         given, raw, number, _ = key
         name = session.spelled(given)
-        while not is_decoded(session):  # noqa: ASYNC110 - no event for doubt
-            await anyio.sleep(PROGRESS_INTERVAL)
+        await self._decoded()
         askers, params = self._sets[key], session.table.params
         if name not in params or params[name].trust is Trust.CACHED:
             await read(session, name)
