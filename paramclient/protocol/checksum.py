@@ -6,8 +6,8 @@ where one value of a range differs, its new bits follow from each row in which i
 these are a simple value is probably the one.
 
 Such a value can also make up for other changes, and no checksum would show it. So each is read by its index
-too, but for those that always move: their rows are compared alone. Nothing is taken over until the checksums
-of all ranges agree.
+too, but for those that always move by little: their rows are compared alone, or at the end of a short range.
+Nothing is taken over until the checksums of all ranges agree.
 """
 
 from __future__ import annotations
@@ -36,8 +36,6 @@ AT_ONCE: Final = 5
 """Requests sent at once: ArduPilot queues no more of them (GCS_FTP.cpp)."""
 INTERVAL_FIRST: Final = 0.020
 """Seconds from these to the next request: a Plane and a Rover look for requests every 20 ms."""
-SCATTERED: Final = 0.1
-"""Seconds beyond a round trip in which a value that always moves may have done so."""
 INTERVAL: Final = 0.006
 """Seconds between further requests: ArduPilot loses some of those sent every 4 ms (measured)."""
 REQUEST_SIZE: Final = 65
@@ -142,7 +140,6 @@ class _Proof:
         self._changed: dict[int, float] = {}  # by index, when the value was known
         self._refuted: set[tuple[int, int]] = set()  # wrong guesses
         self._round_trip = math.inf  # of the quickest requests
-        self._is_scattered = False  # the latest checksums
         self._byte_time = 0.0  # seconds for each byte of requests that waited for each other
         table, now = session.table, anyio.current_time()
         measures = session.identification.vehicle_type in PLANES_AND_ROVERS
@@ -154,7 +151,7 @@ class _Proof:
         is_first = any(param.trust is Trust.CACHED for param in table.params.values())
         is_slow = is_first and (session.channel.timing.round_trip or 0.0) > SLOW_ROUND_TRIP
         passed = {at for at in seconds if is_first and now - table.moments.get(rows[at].name, now) >= 1}
-        self._alone = self._always | passed | ({0} if is_slow else set())  # compared first; 0 shows the count
+        self._alone = passed | ({0} if is_slow else set())  # compared first; 0 shows the count
         self._fresh = set[int]() if is_slow else self._alone
 
     async def run(self) -> bool:
@@ -164,8 +161,9 @@ class _Proof:
             TableDiffers: the tables are too different.
         """
         rows, whole, repeats = self._rows, range(len(self._rows)), 0
-        first = {whole, *(range(at, at + 1) for at in self._alone)}
-        await self._request(first)
+        ends = {0, len(rows), *sorted(self._always)[:1], *(at + 1 for at in self._always)}
+        between = {range(*each) for each in pairwise(sorted(ends))}
+        await self._request(between | {range(at, at + 1) for at in self._alone})
         suspects: set[int] = set()
         while places := self._differing():
             if len(places) > 1:
@@ -174,10 +172,6 @@ class _Proof:
             for at, bits in moved:
                 self._take(at, bits, anyio.current_time())
             if moved:
-                continue
-            if self._always and self._is_scattered and not repeats and whole in places:
-                repeats += 1
-                await self._request(first)
                 continue
             if any(len(place) == 1 and rows[place.start].name == BOOT_COUNT for place in places):
                 suspects = self._named(MEASURED)
@@ -191,7 +185,7 @@ class _Proof:
                 elif guess := self._guess(place, difference):
                     guesses |= guess
                 elif len(place) > 1:
-                    moving = self._moving - (self._fresh if len(place) == len(self._rows) else set())
+                    moving = self._moving - (self._fresh if place in between else set())
                     ends = {end for at in moving for end in (at, at + 1)}.intersection(place[1:])
                     if not ends:
                         divided.append(place)
@@ -256,12 +250,13 @@ class _Proof:
             raise TableDiffers(OTHER)
 
     def _guess_moved(self, place: range, difference: int) -> Iterator[tuple[int, int]]:
-        """Yield the index and the bits of a value, alone in its range, that has just moved as it always does:
-        hardly anything else explains it, so that it needs no read."""
-        moments, now = self._session.table.moments, anyio.current_time()
-        if len(place) == 1:
+        """Yield the index and the bits of a value that has just moved as it always does, alone or last in
+        its range: hardly anything else explains it, so that it needs no read."""
+        row, now = self._rows[place[-1]], anyio.current_time()
+        passed = now - self._session.table.moments.get(row.name, now)
+        if len(place) == 1 or place[-1] in self._always:
             for at, bits in self._explanations(place, difference):
-                if _has_just_moved(self._rows[at], bits, now - moments.get(self._rows[at].name, now)):
+                if at == place[-1] and _has_just_moved(row, bits, passed):
                     yield at, bits
 
     def _guess(self, place: range, difference: int) -> dict[int, int]:
@@ -318,7 +313,6 @@ class _Proof:
             await anyio.lowlevel.checkpoint()  # the requests are sent first
             self._entries(ranges[0])  # while the vehicle computes
         elapsed = anyio.current_time() - sent_at
-        self._is_scattered = elapsed > (session.channel.timing.round_trip or elapsed) + SCATTERED
         self._round_trip = min(self._round_trip, elapsed)
         self._byte_time = (elapsed - self._round_trip) / (REQUEST_SIZE * len(ranges))
 
