@@ -25,8 +25,6 @@ WHY_NONE = (
     " others may be made, by its URL, in PARAMCLIENT_TEST_POSTGRES"
 )
 
-_START_TIMEOUT = 30.0
-
 
 def _programs() -> Path | None:
     """Where `initdb` and `postgres` are. pgserver is not imported: it makes files and users of its own."""
@@ -69,7 +67,7 @@ class Server:
         """
         import psycopg
 
-        deadline = time.monotonic() + _START_TIMEOUT
+        deadline = time.monotonic() + 30.0
         while True:
             if self._process is None or self._process.poll() is not None:
                 self._process = self._launch()

@@ -17,7 +17,6 @@ from tests.sync_stub import STUB, meaning, stub
 from tests.test_docs import run
 
 NAME = "MC_ROLL_P"
-SILENT = "udpin:127.0.0.1:0"
 
 
 def test_the_types_are_those_of_the_asynchronous_client() -> None:
@@ -136,7 +135,7 @@ def test_threads_share_a_client_and_closing_ends_their_calls() -> None:
     "call", [lambda client: client.component(timeout=None), lambda client: client.events().next()]
 )
 def test_ctrl_c_ends_a_call_and_the_client_goes_on(call: Callable[[ParamClient], object]) -> None:
-    with ParamClient(SILENT, cache=False) as client:
+    with ParamClient("udpin:127.0.0.1:0", cache=False) as client:
         threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
         with pytest.raises(KeyboardInterrupt):
             call(client)

@@ -153,11 +153,10 @@ def vehicle_json(vehicle: Component) -> JsonObject:
 
 def origin_json(params: ParamSet) -> JsonObject:
     """Return the origin of a set, and the time at which the vehicle had these values."""
-    identity = params.identity
     return {
         **taken(params, "source", "system", "component"),
         "autopilot": params.autopilot or None,
-        "uid": None if identity is None else identity.uid,
+        "uid": params.identity and params.identity.uid,
         "at": time_or_none(params.at),
         "count": len(params),
         **known_members(lacks=params.lacks or None),
@@ -217,6 +216,12 @@ def outcome_json(outcome: SetOutcome, vehicle: Component, metadata: Metadata | N
         text=None if info is None or actual is None else info.text(actual) or None,
         reboot_required=info and (info.reboot_required or None),
     )
+
+
+def results_json(outcomes: Iterable[SetOutcome], vehicle: Component, metadata: Metadata | None) -> JsonObject:
+    """Return a vehicle and the outcomes of writes to it; see `outcome_json`."""
+    results = [outcome_json(each, vehicle, metadata) for each in outcomes]
+    return taken(vehicle, "system", "component") | {"vehicle": vehicle_json(vehicle), "results": results}
 
 
 # Comparisons

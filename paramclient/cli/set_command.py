@@ -14,7 +14,7 @@ import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from paramclient.cli.json_output import JsonObject, info_of, outcome_json, vehicle_json
+from paramclient.cli.json_output import JsonObject, info_of, results_json
 from paramclient.cli.metadata import MetadataChoice, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import ExitCode, Status, can_ask, code_of, confirm, report, say
@@ -216,9 +216,7 @@ class SetJob:
 
     def as_json(self) -> JsonObject:
         """Return the JSON of the vehicle and the outcomes."""
-        component = self.session.component
-        results = [outcome_json(each, component, self.described) for each in self.outcomes.values()]
-        return {"vehicle": vehicle_json(component), "results": results}
+        return results_json(self.outcomes.values(), self.session.component, self.described)
 
     def rows(self) -> Iterator[Sequence[object]]:
         """Yield the rows; the reported value with its meaning, if that is known."""

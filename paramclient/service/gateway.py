@@ -37,6 +37,8 @@ OWN_TYPE: Final = 18
 GROUND_STATION_PARAMS: Final = frozenset({"SYSID_MYGCS", "MAV_GCS_SYSID"})
 """ArduPilot's parameter with the system id of its ground station, whose heartbeats it watches; one with `_HI`
 behind this name has the last of several."""
+TAKE_OVER_TIME: Final = 10.0
+"""Seconds after which a list that was asked before the vehicle was heard is not expected any more."""
 LOOP_TIME: Final = 2.0
 """Seconds after which a frame that was sent is not taken for its own copy any more."""
 
@@ -52,8 +54,8 @@ HEARTBEAT: Final = message_id(messages.Heartbeat)
 FILE_TRANSFER: Final = message_id(messages.FileTransfer)
 HARMLESS: Final = frozenset({HEARTBEAT, message_id(messages.SystemTime), 4, 66, 111})
 """What passes from the stations of a read-only endpoint, with PING, REQUEST_DATA_STREAM and TIMESYNC."""
-COMMANDS: Final = frozenset({75, 76})
-"""COMMAND_INT and COMMAND_LONG: both have the command at byte 28."""
+COMMANDS: Final = {75: 28, 76: 28, 77: 0}
+"""COMMAND_INT, COMMAND_LONG and COMMAND_ACK: where they have the command."""
 HARMLESS_COMMANDS: Final = (messages.MAV_CMD_REQUEST_MESSAGE, messages.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
 HARMLESS_OPCODES: Final = {*Opcode} - {Opcode.CREATE_FILE, Opcode.WRITE_FILE, Opcode.OPEN_FILE_WO}
 """The requests of MAVFTP that write nothing."""
@@ -123,16 +125,25 @@ class Gateway:
         if bears_key(seen.data) or (table is None and self.copies.is_copy(seen.data, (link, peer))):
             return
         for station in self.stations:
-            is_withheld = table is not None and self._serves(station, table, link)
-            station.relay(seen, is_withheld=is_withheld)
-            if table is not None and is_withheld:
-                table.take_over(station)
+            served = table if table is not None and self._serves(station, table, link) else None
+            station.relay(seen, is_withheld=served is not None)
+            at, address, extended, answered = station.list_asked  # before the vehicle was heard
+            is_open = anyio.current_time() - at < TAKE_OVER_TIME and served not in answered
+            if served is not None and is_open and served in link.tables(*address, extended=extended):
+                answered.add(served)
+                served.send_list(station)
 
     def announce(self, link: VehicleLink, table: KeptTable, message: Message) -> None:
         """Send a value that has changed to all stations."""
         for station in self.stations:
             if self._serves(station, table, link):
                 station.say(message, table.source, is_answer=False)
+
+    def doubt(self, system: int, *names: str, extended: bool = False) -> None:
+        """Doubt these values of a system, or all: a reset changes them, and PX4 does not announce it."""
+        for link in self.links:
+            for table in link.tables(system, COMP_ID_ALL, extended=extended):
+                table.doubt(*names)
 
     # requests
 
@@ -152,11 +163,9 @@ class Gateway:
                 return
         if not station.endpoint.is_readonly or _is_harmless(frame, message):
             self._pass(station, seen)
-            command = int.from_bytes(frame.payload[28:30], "little") if frame.message_id in COMMANDS else 0
-            if command == messages.MAV_CMD_PREFLIGHT_STORAGE:
-                for link in self.links:
-                    for table in link.tables(_target_of(frame), COMP_ID_ALL, extended=False):
-                        table.doubt()  # it may reset all, which PX4 does not announce
+            names = (message.param_id,) if isinstance(message, SetRequest) else ()  # its answer may be lost
+            if names or _is_reset(frame):
+                self.doubt(_target_of(frame), *names, extended=isinstance(message, EXTENDED_REQUESTS))
 
     def _answer(self, station: GroundStation, source: Source, message: Request, seen: SeenFrame) -> bool:
         """Answer a request about parameters; return False for one that passes to the vehicles.
@@ -269,6 +278,8 @@ class VehicleLink(Tap):
                 if seen.is_signed or self._station.verifier is not None:
                     self.signing.add(source)
                 node = self._station.nodes.get(source)
+                if _is_reset(seen.frame):
+                    self._gateway.doubt(source[0])  # again: values from before were on their way
                 if seen.frame.message_id == HEARTBEAT and node is not None:
                     for table in (self._table(node, extended=each) for each in (False, True)):
                         table.heartbeat, table.beats = decode(seen.frame), table.beats + 1
@@ -386,6 +397,12 @@ def _target_of(frame: Frame) -> int:
     """Return the target system of a frame; 0 for all, and for a message without one."""
     at = TARGET_OFFSETS.get(frame.message_id, len(frame.payload))
     return frame.payload[at] if at < len(frame.payload) else 0
+
+
+def _is_reset(frame: Frame) -> bool:
+    """Return whether a frame is the command that may reset all parameters, or its acknowledgement."""
+    at = COMMANDS.get(frame.message_id, len(frame.payload))
+    return int.from_bytes(frame.payload[at : at + 2], "little") == messages.MAV_CMD_PREFLIGHT_STORAGE
 
 
 def _readdressed(message: ListRequest, frame: Frame, target: Source) -> bytes:

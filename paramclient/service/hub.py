@@ -164,9 +164,8 @@ class Target:
     @property
     def address(self) -> dict[str, Any]:
         """The members that name it in an event."""
-        each = self.component
-        ids = {"system": each.system, "component": each.component, "extended": each.is_extended}
-        return {"link": self.link.name, **ids}
+        ids = taken(self.component, "system", "component")
+        return {"link": self.link.name, **ids, "extended": self.component.is_extended}
 
     @property
     def is_listed(self) -> bool:
@@ -393,12 +392,9 @@ class Hub:
             if name in self.links:
                 raise UsageError(f"the link {name} is given twice")
             is_log = isinstance(link, str) and link.startswith("replay:")
-            make = partial(self._new_client, link, cache=False if is_log else self.cache or False, **options)
+            make = partial(ParamClient, link, cache=False if is_log else self.cache or False, **options)
             make()  # an invalid option raises here
             self.links[name] = ServiceLink(name, make)
-
-    def _new_client(self, link: LinkChoice, **options: Any) -> ParamClient:
-        return self.gateway.attach(ParamClient(link, **options))
 
     async def __aenter__(self) -> Hub:
         await self.gateway.open()
@@ -448,7 +444,7 @@ class Hub:
         attempts = 0
         while True:
             try:
-                client = link.make()
+                client = self.gateway.attach(link.make())
                 events = client.events()
                 async with client, task_group() as tasks:
                     link.client, attempts = client, 0

@@ -25,6 +25,7 @@ from paramclient.model.values import (
 )
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.dialect import ReportedValue
+from paramclient.protocol.digest import may_confirm
 from paramclient.protocol.reads import read, read_again
 from paramclient.protocol.session import Session
 from paramclient.protocol.table import Change
@@ -52,8 +53,6 @@ SET_TIMEOUT: Final = 2.9
 OVERTAKING_BEATS: Final = 2
 """Heartbeats since a set that show, during a fetch, that its acknowledgement does not wait behind the list in
 the radio's queue: an error would be wrong then. The first of them may be older than the set."""
-TAKE_OVER_TIME: Final = 10.0
-"""Seconds after which a list that was asked before the vehicle was heard is not expected any more."""
 REMEMBERED_TIME: Final = 30.0
 """Seconds for which is remembered that the vehicle does not have a name, or has not sent all of its list, and
 for which requests pass to a component that did not answer the gateway's own fetch."""
@@ -255,10 +254,15 @@ class KeptTable(Stream[Change]):
             self.component.watch.unconfirmed()
             self.session.table.doubt()
 
-    def doubt(self) -> None:
-        """Have the table checked, and serve none of its values before: something may have changed them."""
-        self.component.watch.doubt()
-        self.session.table.doubt()
+    def doubt(self, *names: str) -> None:
+        """Have the table checked, and serve none of its values before: something may have changed them.
+
+        With names, these are read when they are asked for, unless a check finds them anyway.
+        """
+        if not names:
+            self.component.watch.doubt()
+        if not (names and may_confirm(self.session)):
+            self.session.table.doubt(*names)
 
     def push(self, item: Change) -> None:
         """Take a change, and announce it unless it is a first value."""
@@ -277,15 +281,6 @@ class KeptTable(Stream[Change]):
         else:
             self._listing.setdefault(station, set())
             self.load()
-
-    def take_over(self, station: GroundStation) -> None:
-        """Answer a list that was asked before, now that the vehicle is heard and its values are withheld."""
-        at, (system, component), extended, taken = station.list_asked
-        is_new = anyio.current_time() - at < TAKE_OVER_TIME and self not in taken
-        is_meant = system in (0, self.source[0]) and component in (0, self.source[1])
-        if is_new and is_meant and extended == self.session.dialect.has_ack:
-            taken.add(self)
-            self.send_list(station)
 
     def _stream(self, station: GroundStation, values: Iterable[ReportedValue], sent: set[int]) -> None:
         """Send the values of one list, each as it is by then, until one is in doubt or the component is lost.

@@ -337,11 +337,8 @@ async def set_params(author: Author, target: TargetArgument, body: WriteManyRequ
     """
     values = await target.values(body.values, force=body.force)
     result = await target.component.set_many(values, **body.model_dump(exclude={"values"}), author=author)
-    component, metadata = target.component, target.metadata
-    results = [json_output.outcome_json(each, component, metadata) for each in result.outcomes]
     error = {} if result.error is None else {"error": str(result.error)}
-    ids = {"system": component.system, "component": component.component}
-    return {**ids, "vehicle": json_output.vehicle_json(component), "results": results, **error}
+    return json_output.results_json(result.outcomes, target.component, target.metadata) | error
 
 
 @reading.post(f"{VEHICLE}/fetch")

@@ -79,16 +79,6 @@ def is_idle(client: ParamClient) -> bool:
     return not any(shell.residue(each) for each in client.components.values())
 
 
-async def check_after(call: Call, client: ParamClient, component: Component) -> None:
-    """A call was cancelled: nothing is left, and it can be made again."""
-    assert is_idle(client)
-    await call(client, component)
-    await shell.settled()
-    assert is_idle(client)
-    await asyncio.sleep(0.5)
-    assert is_idle(client)
-
-
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
 @pytest.mark.parametrize("how", ["task", "scope"])
 async def test_cancelled_at_each_point(call: Call, how: str) -> None:
@@ -110,7 +100,12 @@ async def test_cancelled_at_each_point(call: Call, how: str) -> None:
             assert was_cancelled == is_struck or (how == "scope" and not was_cancelled)
             await shell.settled()
             assert shell.tasks_beside() == before
-            await check_after(call, client, component)
+            assert is_idle(client)
+            await call(client, component)  # it can be made again
+            await shell.settled()
+            assert is_idle(client)
+            await asyncio.sleep(0.5)
+            assert is_idle(client)
         assert not shell.tasks_beside()
         if not is_struck:
             break

@@ -65,9 +65,6 @@ class World:
     session: Session
 
 
-Step = Callable[[World], Awaitable[object]]
-
-
 class Sessions(RuleBasedStateMachine):
     """Collects the steps of a session, and runs it in virtual time at the end."""
 
@@ -75,7 +72,7 @@ class Sessions(RuleBasedStateMachine):
     def begin(self, kind: str, faults: Faults, seed: int) -> None:
         """Choose vehicle and link."""
         self.kind, self.faults, self.seed = kind, faults, seed
-        self.steps: list[Step] = []
+        self.steps: list[Callable[[World], Awaitable[object]]] = []
 
     @rule()
     def fetch(self) -> None:

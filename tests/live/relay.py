@@ -290,8 +290,7 @@ class _Traffic:
                 """Take changes of the conditions, in a thread; the end of the connection ends the relay."""
                 try:
                     while True:
-                        conditions = control.recv()
-                        control.send(anyio.from_thread.run_sync(self._change, conditions, token=token))
+                        control.send(anyio.from_thread.run_sync(self._change, control.recv(), token=token))
                 except (EOFError, OSError):
                     anyio.from_thread.run_sync(tasks.cancel_scope.cancel, token=token)
 

@@ -20,7 +20,6 @@ from paramclient.protocol.dialect import PLAIN
 
 BYTEWISE, C_CAST = Encoding.BYTEWISE, Encoding.C_CAST
 INTEGERS = [kind for kind in ParamType if kind.is_integer]
-UNDEFINED = [0, 77, 255]
 
 SIGNALLING = [(0xFF800001, 0xFFBFFFFF), (0x7F800001, 0x7FBFFFFF)]
 """Bit patterns of signalling NaNs. As INT32: −8388607 to −4194305 and 2139095041 to 2143289343."""
@@ -59,7 +58,7 @@ def param(bits: int = 0x3F800000, value: Value = 1.0, kind: int = ParamType.REAL
 # Types
 
 
-@pytest.mark.parametrize("number", UNDEFINED)
+@pytest.mark.parametrize("number", [0, 77, 255])
 def test_a_param_of_an_unknown_type_has_a_number_and_is_raw(number: int) -> None:
     param = Param("X", b"\x01\x02\x03\x84", number, None, 0x84030201)
     assert (param.type, param.type.name) == (number, f"TYPE_{number}")

@@ -108,8 +108,9 @@ class Partner:
         for frame in self._framer.receive(data):
             source = (frame.system, frame.component)
             if source in self._last:
-                gap = (frame.sequence - self._last[source] - 1) & 0xFF
-                self.lost[source] = self.lost.get(source, 0) + gap
+                self.lost[source] = self.lost.get(source, 0) + (
+                    frame.sequence - self._last[source] - 1 & 0xFF
+                )
             self._last[source] = frame.sequence
             self.frames.append(frame)
             self.times.append(now)

@@ -615,6 +615,19 @@ async def test_rule_3_a_value_is_not_served_after_a_set_without_an_answer(silenc
         assert await listed(station) == 24
 
 
+async def test_rule_3_a_value_is_read_again_after_a_set_that_passes() -> None:
+    """To any vehicle: its acknowledgement may be lost."""
+    vehicle = Tap(generic())
+    async with gateway_over(vehicle, generic(system=2)) as served:
+        await served.synced()
+        station = served.partner()
+        vehicle.is_mute = True
+        await station.ask(replace(set_to("PARAM_03", 5, ParamType.REAL32), target_system=0))
+        vehicle.is_mute = False
+        await station.ask(ParamRequestRead(1, 1, "PARAM_03", -1))
+        assert by_name(station) == {"PARAM_03": struct.pack("<f", 5)}
+
+
 async def test_rule_3_a_value_is_served_without_its_index_after_another_count() -> None:
     """The values are those of the vehicle, and the indices of an earlier list."""
     also = Puppet(lambda message: (), heartbeat=None)
@@ -1300,11 +1313,15 @@ async def test_a_silent_reset_by_a_station_is_found() -> None:
             assert values == {struct.pack("<i", value)}
 
 
-async def test_a_silent_reset_ends_a_list() -> None:
-    async with in_sync(PX4Vehicle()) as (_, _, station):
+async def test_a_silent_reset_ends_a_list_and_no_value_on_its_way_is_served() -> None:
+    async with in_sync(Air.symmetric([PX4Vehicle()], delay=0.1)) as (_, _, station):
+        await station.ask(set_to("CAL_ACC0_XOFF", 5, ParamType.REAL32), seconds=0.15)
         await station.ask(LIST, seconds=0.01)
         await station.ask(messages.CommandLong(1, 1, messages.MAV_CMD_PREFLIGHT_STORAGE, 2.0), seconds=0.03)
         assert len(station.of(ParamValue)) <= 37
+        await anyio.sleep(3.0)
+        await station.ask(ParamRequestRead(1, 1, "CAL_ACC0_XOFF", -1))
+        assert by_name(station) == {"CAL_ACC0_XOFF": bytes(4)}
 
 
 async def test_a_restart_during_a_list() -> None:

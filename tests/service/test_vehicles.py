@@ -239,8 +239,8 @@ async def test_extended_parameters_are_fetched_written_and_followed() -> None:
         fetched = (await browser.post(f"{CAMERA}/fetch", params=EXT, json={})).json()
         known = (await browser.get(f"{CAMERA}/params", params=EXT)).json()["params"]
         assert fetched["received"] == len(known) > 1
-        wide = {"value": "9007199254740993"}  # as text, of which a float has not all digits
-        done = await browser.put(f"{CAMERA}/params/WIDE", params=EXT, json=wide)
+        # as text, of which a float has not all digits
+        done = await browser.put(f"{CAMERA}/params/WIDE", params=EXT, json={"value": "9007199254740993"})
         assert done.json()["actual"] == 9007199254740993
         done = await browser.put(f"{CAMERA}/params/CAM_NAME", params=EXT, json={"value": "Rear"})
         assert (done.json()["status"], done.json()["actual"]) == ("accepted", "Rear")

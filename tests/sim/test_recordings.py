@@ -186,8 +186,7 @@ def test_every_recording_is_replayed() -> None:
 def test_a_recording_of_a_quiet_vehicle_is_replayed(name: str) -> None:
     make, phase = (ARDUPILOT | PX4)[name]
     recorded, sent = compared(from_vehicle(name)), compared(replay(make(name), name, phase=phase))
-    burst = 10 if name in ARDUPILOT else 20
-    assert differences(name, recorded, sent, burst=burst, unasked=UNASKED) == []
+    assert differences(name, recorded, sent, burst=10 if name in ARDUPILOT else 20, unasked=UNASKED) == []
 
 
 def test_px4_full_download() -> None:
@@ -208,8 +207,7 @@ def test_px4_get_set() -> None:
     vehicle = PX4Vehicle(unsaved=BAROMETER)
     recorded = compared(from_vehicle(name))
     assert differences(name, recorded, compared(replay(vehicle, name, phase=0.004)), burst=20) == []
-    last = param_values(recorded)[-1]
-    assert int.from_bytes(last.raw, "little") == vehicle.announced_hash() != PX4_HASH
+    assert int.from_bytes(param_values(recorded)[-1].raw, "little") == vehicle.announced_hash() != PX4_HASH
 
 
 def test_px4_20_sets() -> None:
@@ -217,8 +215,7 @@ def test_px4_20_sets() -> None:
     missing at random, so only the acknowledgements are compared there."""
     name = "px4_20_sets"
     recorded = without_pushes(name, compared(from_vehicle(name)), 3.34)
-    vehicle = px4_of("px4_list_beside_reads")
-    sent = without_pushes(name, compared(replay(vehicle, name, phase=0.0095)), 3.34)
+    sent = without_pushes(name, compared(replay(px4_of("px4_list_beside_reads"), name, phase=0.0095)), 3.34)
     assert differences(name, recorded, sent, burst=20, unasked=UNASKED) == []
 
 
