@@ -206,6 +206,13 @@ async def read_many(session: Session, names: Iterable[str]) -> None:
     session.channel.gate.check()
 
 
+def is_stale(session: Session, name: str, age: float) -> bool:
+    """Return whether a known value is older than so many seconds, not being read, and outside PX4's hash, so
+    that nothing tells of a change."""
+    is_old = anyio.current_time() - session.table.moments.get(name, math.inf) > age
+    return is_old and name in session.table.volatile and name not in session.reading
+
+
 async def read_again(session: Session, name: str, at: float) -> None:
     """Read a parameter at a time; it may fail."""
     await anyio.sleep_until(at)
@@ -254,7 +261,7 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
         if control is None or is_proven or control.param_id == which:
             return control
         if str not in session.serves_reads:
-            await anyio.sleep(session.channel.timing.slowest)  # for its other answers
+            await anyio.sleep(1.25 * session.channel.timing.slowest)  # for its other answers
             await _try(session, control.param_id)
         session.only_by_index = session.serves_reads.get(str) is False
         return control if session.serves_reads.get(str) else None

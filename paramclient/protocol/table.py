@@ -162,8 +162,8 @@ class Table:
                 of a known integer.
         """
         name, raw, number, count, index = message
-        if name == HASH_CHECK:
-            return
+        if name == HASH_CHECK or (not name and (self.is_growing or index >= count)):
+            return  # without a name, some firmware says that there is none
         place = self._take_count(name, count, index)
         if not self._may_store(name):
             if place is not None:

@@ -24,7 +24,7 @@ class Partial(Puppet):
 
     Args:
         table: values and types, by name.
-        serves: of `EVERYTHING`.
+        serves: of `EVERYTHING`; with "ends", an empty name to a read of any other index.
         first, step: the first index, and the interval between two.
         count: returns the param_count of an index.
         encoding: of the values.
@@ -83,6 +83,8 @@ class Partial(Puppet):
                 name = by_index.get(index, "") if index >= 0 else name if "names" in self._serves else ""
                 if name in self.values:
                     yield self._value(name)
+                elif index >= 0 and "ends" in self._serves:
+                    yield messages.ParamValue("", bytes(4), ParamType.REAL32, self._count(index), index)
             case messages.ParamSet() if self._on_set is not None:
                 yield from self._on_set(message)
             case messages.ParamSet(param_id=name, raw=raw) if name in self.values:

@@ -189,6 +189,27 @@ async def test_reads_by_index_alone_suffice_on_a_lossy_link(seed: int) -> None:
             assert (await write(session, "MODE", 4)).status == "accepted"
 
 
+@pytest.mark.parametrize("count", [lambda index: index + 1, lambda index: 0])
+@pytest.mark.parametrize("serves", [("list", "indices", "ends"), ("indices", "ends")])
+async def test_an_answer_without_a_name_ends_the_table(
+    serves: tuple[str, ...], count: Callable[[int], int]
+) -> None:
+    """As of DroneCAN nodes, to reads beyond the end."""
+    async with talking(Partial(FORTY, serves=serves, count=count)) as (_, session):
+        assert (await fetch_all(session)).params.keys() == FORTY.keys()
+        assert anyio.current_time() < 15.0
+
+
+async def test_there_are_no_parameters_where_a_list_has_no_name() -> None:
+    """As of INAV."""
+    none = messages.ParamValue("", bytes(4), ParamType.REAL32, 0, 0)
+    inav = Puppet(lambda message: [none] * isinstance(message, messages.ParamRequestList), heartbeat=PX4)
+    async with talking(inav) as (_, session):
+        with pytest.raises(errors.NoReply):
+            await fetch_all(session)
+        assert not session.table.left_out
+
+
 async def test_the_first_value_of_a_list_that_is_lost_is_missing_and_no_other() -> None:
     vehicle = Tap(Partial(serves=("list",)), down=lambda message: getattr(message, "param_index", None) != 0)
     async with talking(vehicle) as (_, session):
@@ -339,9 +360,7 @@ async def test_the_answer_to_a_control_read_is_none_to_another_read() -> None:
 @pytest.mark.parametrize("heartbeat", [ARDUPILOT, QUIET, PX4], ids=["AP", "generic", "PX4"])
 @pytest.mark.parametrize("parts", [("list", "sets"), ("list", "sets", "acks")], ids="+".join)
 @virtual_on_both
-async def test_a_listed_value_is_taken_before_the_end(
-    heartbeat: messages.Heartbeat, parts: tuple[str, ...]
-) -> None:
+async def test_a_listed_value_counts_at_once(heartbeat: messages.Heartbeat, parts: tuple[str, ...]) -> None:
     count = len(TABLE) + 3_000
     table = {name: (value, ParamType.REAL32) for name, (value, _) in TABLE.items()}
     vehicle = Partial(table, serves=parts, heartbeat=heartbeat, count=lambda index: count)
