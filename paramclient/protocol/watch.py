@@ -179,6 +179,8 @@ class Watch:
             return  # another station's file is open, for example
         if not answer.is_current:
             self._before, self._is_doubted = before, True
+            if answer.is_other or answer.digest is not None:
+                table.doubt()
         if not answer.is_current or any(param.trust is Trust.CACHED for param in table.params.values()):
             result = await fetch_all(session, refresh=not answer.is_current)
             if not result.complete:

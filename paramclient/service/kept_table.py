@@ -26,7 +26,7 @@ from paramclient.model.values import (
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.dialect import ReportedValue
 from paramclient.protocol.digest import may_confirm
-from paramclient.protocol.reads import read, read_again
+from paramclient.protocol.reads import is_stale, read, read_again
 from paramclient.protocol.session import Session
 from paramclient.protocol.table import Change
 from paramclient.protocol.watch import SyncState
@@ -372,6 +372,8 @@ class KeptTable(Stream[Change]):
         self.check()
         if value := self.known(which):
             asker.station.say(value, self.source)
+            if is_stale(self.session, value.param_id, PROOF_AGE_MAX):
+                self.component.core.spawn(read_again, self.session, value.param_id, 0.0)
         elif self._is_unknown(which):
             self._refuse([asker], which, ParamErrorCode.DOES_NOT_EXIST)
         elif self._reads.begins(which, asker):
@@ -440,17 +442,18 @@ class KeptTable(Stream[Change]):
         code, is_open, table = int(ParamErrorCode.COMPONENT_NOT_FOUND), True, self.session.table
         try:
             while is_open:
-                began, beats_min = anyio.current_time(), self.beats + OVERTAKING_BEATS
-                known = table.names.get(min(table.names, default=-1), key[0]) if self.is_loading else None
-                with anyio.move_on_after(SET_TIMEOUT) as scope:
-                    async with first.station.writing, task_group() as tasks:
-                        tasks.start_soon(self._wait_longer, key, scope)
-                        if known is not None:
-                            tasks.start_soon(read_again, self.session, known, began)
-                        code = await self._write(key, f"station {first.system}/{first.component}")
-                        tasks.cancel_scope.cancel()
+                async with first.station.writing, task_group() as tasks:
+                    began, beats_min = anyio.current_time(), self.beats + OVERTAKING_BEATS
+                    known = table.names.get(min(table.names, default=-1), key[0]) if self.is_loading else None
+                    tasks.cancel_scope.deadline = began + SET_TIMEOUT
+                    tasks.start_soon(self._wait_longer, key, tasks.cancel_scope)
+                    if known is not None:
+                        tasks.start_soon(read_again, self.session, known, began)
+                    code = await self._write(key, f"station {first.system}/{first.component}")
+                    tasks.cancel_scope.cancel()
                 is_late = table.moments.get(known or "", began) - began > SET_TIMEOUT / 2
-                is_open = scope.cancelled_caught and known is not None and (self.beats < beats_min or is_late)
+                may_come = known is not None and (self.beats < beats_min or is_late)
+                is_open = code == ParamErrorCode.COMPONENT_NOT_FOUND and may_come
         except ParamClientError as error:
             code = _code_of(error)
         finally:
@@ -498,7 +501,7 @@ class KeptTable(Stream[Change]):
 
     def _say(self, askers: Iterable[Asker], message: Message) -> None:
         for asker in () if self.is_lost else askers:
-            asker.station.say(message, self.source)
+            asker.station.say(message, self.source, is_answer=False)
 
     def _reject(self, askers: Iterable[Asker], key: SetKey, code: int) -> None:
         """Refuse a set, and show the value that stays."""
@@ -523,6 +526,5 @@ class KeptTable(Stream[Change]):
 
 def _code_of(error: ParamClientError) -> int:
     """Return the PARAM_ERROR of an error."""
-    if isinstance(error, errors.Refused):
-        return error.code
-    return next(code for kinds, code in CODES if isinstance(error, kinds))
+    codes = (code for kinds, code in CODES if isinstance(error, kinds))
+    return error.code if isinstance(error, errors.Refused) else next(codes)

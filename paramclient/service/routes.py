@@ -344,11 +344,10 @@ async def set_params(author: Author, target: TargetArgument, body: WriteManyRequ
 @reading.post(f"{VEHICLE}/fetch")
 async def fetch(target: TargetArgument, body: FetchRequest) -> JsonObject:
     """Fetch all parameters. Simultaneous requests share one download; the progress is in the events."""
-    component = target.component
     result = await target.fetch(refresh=body.refresh, timeout=body.timeout_s)
     if body.metadata:
         await target.load_metadata(timeout=body.timeout_s)
-    return json_output.fetch_json(component, result, component.params.values(), target.metadata)
+    return json_output.fetch_json(target.component, result, target.component.params.values(), target.metadata)
 
 
 # files

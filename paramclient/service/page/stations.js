@@ -29,15 +29,15 @@ export async function showStations() {
 
 function item(station) {
   const asked = Object.entries(station.requests).map(([kind, count]) => `${count} × ${kind}`);
-  const ids = station.ids.length ? `as ${station.ids.join(", ")}, ` : "";
+  const heard = `as ${station.ids.join(", ")}, MAVLink ${station.mavlink}, last heard ${span(station.silence_s)} ago`;
   return el(
     "li",
     {},
     el("b", { text: station.name }),
-    el("small", { text: `${ids}MAVLink ${station.mavlink}, last heard ${span(station.silence_s)} ago` }),
+    el("small", { text: station.ids.length ? heard : "Not heard yet" }),
     el("small", { text: asked.length ? `Asked for: ${asked.join(", ")}` : "Has asked for no parameters" }),
     el("small", { text: `${many(station.answered, "answer")} from the cache, ${size(station.saved_bytes)} saved` }),
-    station.dropped > 0 && el("small", { class: "fault", text: `${many(station.dropped, "frame")} dropped: it does not read` }),
+    station.dropped > 0 && el("small", { class: "fault", text: `${many(station.dropped, "frame")} dropped: it reads too slowly` }),
   );
 }
 

@@ -36,8 +36,6 @@ const LINK_PROBLEMS = { failed: "link failed", opening: "link opening", ended: "
 export function stateOf(component) {
   const link = component.link_state;
   if (link !== "open") return { text: LINK_PROBLEMS[link] ?? link, kind: link === "ended" ? "idle" : "bad" };
-  if (component.state === "lost")
-    return { text: `lost${component.silence_s ? ` for ${span(component.silence_s)}` : ""}`, kind: "bad" };
   if (component.fetch) return { text: progressText(component.fetch), kind: "busy" };
   return { text: STATES[component.state] ?? component.state, kind: KINDS[component.state] ?? "idle" };
 }
