@@ -408,9 +408,7 @@ class Interrupting(GenericVehicle):
 
 @pytest.mark.parametrize("as_json", [False, True])
 @pytest.mark.parametrize("name", ["apply", "set"])
-def test_ctrl_c_prints_the_outcomes_so_far(
-    command: Command, put: Put, file: File, name: str, as_json: bool
-) -> None:
+def test_ctrl_c_prints_what_is_done(command: Command, put: Put, file: File, name: str, as_json: bool) -> None:
     names = [f"P{number:02}" for number in range(40)]
     vehicle = Interrupting(dict.fromkeys(names, 1))
     wanted: list[object] = [file("".join(f"{each},2\n" for each in names))]

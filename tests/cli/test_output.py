@@ -38,9 +38,7 @@ def test_sentences_in_the_last_column_are_wrapped_at_spaces(printed: Print) -> N
     assert " ".join(" ".join(lines[1:]).split()) == f"MC_ROLL_P {reason}"
 
 
-def test_lines_are_wrapped_at_spaces(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lines_wrap_at_spaces(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     change = "  changed: 2026-11-24T14:39:42.013+01:00  1500.125 -> 16777216.5  (us for ground station 2)"
     print_line(change)
     say(change)

@@ -158,9 +158,7 @@ def test_set_and_reset_write_to_every_vehicle(command: Command, put: Put, tmp_pa
     assert [each.values["A"] for each in vehicles] == [2.5, 2.5]
 
 
-def test_save_writes_every_vehicle_into_one_file_or_into_one_each(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
+def test_save_writes_vehicles_into_one_file_or_one_each(command: Command, put: Put, tmp_path: Path) -> None:
     url = put(Air([px4(), copter()]))
     assert command("save", url, tmp_path / "fleet.json", "--vehicle", "all").code == 0
     assert {row[0] for row in command("show", tmp_path / "fleet.json").rows} == {"vehicle", "1/1", "4/1"}

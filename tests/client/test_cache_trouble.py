@@ -113,9 +113,7 @@ async def test_one_cause_has_one_warning(tmp_path: Path, caplog: pytest.LogCaptu
     assert "\n" not in warning
 
 
-async def test_after_many_changes_the_whole_table_is_written(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_many_changes_write_the_whole_table(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache_writer, "PENDING_MAX", 20)
     vehicle = small_px4()
     async with fetched(vehicle, cache=path):

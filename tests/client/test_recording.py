@@ -58,9 +58,7 @@ FRAMES = [frame(number) for number in range(5)]
 
 @pytest.mark.parametrize("size", [1, 7, 64, 4096])
 @pytest.mark.parametrize("place", [0, 2, 4])
-def test_damage_costs_one_frame_whatever_the_blocks(
-    size: int, place: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_damage_costs_one_frame_in_any_blocks(size: int, place: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("paramclient.links.tlog.BLOCK_SIZE", size)
     data = bytearray(log_of(*FRAMES))
     assert [each.data for each in records(bytes(data))] == FRAMES

@@ -99,9 +99,7 @@ def test_invalid_signing_settings_are_refused_at_once() -> None:
 # Timestamps
 
 
-async def test_a_clock_that_was_set_back_adopts_the_vehicles_timestamp(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_clock_set_back_adopts_the_vehicles_timestamp(monkeypatch: pytest.MonkeyPatch) -> None:
     for now in (NOW, NOW - 50 * UNITS_PER_SECOND):
         monkeypatch.setattr(signing, "timestamp_now", lambda now=now: now)
         async with a_client(signed_vehicle(signing_timestamp=NOW)) as client:

@@ -454,9 +454,7 @@ def _swapped(cached: dict[str, Param], one: str, other: str) -> None:
         (_swapped, ["COMPASS_OFS_X", "COMPASS_OFS_Y"]),
     ],
 )
-async def test_a_value_makes_up_for_no_other_name_or_type(
-    change: Callable[..., None], names: list[str]
-) -> None:
+async def test_no_value_makes_up_for_a_name_or_type(change: Callable[..., None], names: list[str]) -> None:
     """The checksum is linear: some value of 4 bytes has it, whatever stands before."""
     vehicle = ArduPilotVehicle(live_period=0.0)
     cached = vehicle.params

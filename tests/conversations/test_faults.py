@@ -44,9 +44,7 @@ def vehicle_on(kind: str, faults: str) -> Vehicle:
 @pytest.mark.parametrize(
     ("make", "seed"), [*((PX4Vehicle, n) for n in range(3)), *((ArduPilotVehicle, n) for n in (8, 23))]
 )
-async def test_a_radio_of_which_the_vehicle_does_not_know_costs_seconds(
-    make: type[Vehicle], seed: int
-) -> None:
+async def test_a_radio_that_the_vehicle_does_not_know_costs_seconds(make: type[Vehicle], seed: int) -> None:
     """At 57600 baud: answers wait behind a whole list for 6 s, and the first block of a file is late."""
     vehicle = make()
     async with talking(Air.symmetric([vehicle], loss=0.05, delay=0.02, rate=5_760, seed=seed)) as (
@@ -110,9 +108,7 @@ any_message = st.one_of(
 @given(st.lists(any_message, max_size=60), st.lists(st.binary(max_size=60), max_size=5))
 @example([messages.ParamExtValue("", b"", 0, *each) for each in ((2, 0), (2, 0), (1, 32768))], [])
 @virtual
-async def test_no_messages_and_no_bytes_raise_in_any_call(
-    heard: list[messages.Message], noise: list[bytes]
-) -> None:
+async def test_no_message_or_byte_raises_in_a_call(heard: list[messages.Message], noise: list[bytes]) -> None:
     async with converse(PX4Vehicle(table={"A": 1, "B": 2.5})) as conversation:
         node = await conversation.node()
         calls: list[Awaitable[object]] = [fetch_all(node.plain), fetch_all(node.extended)]

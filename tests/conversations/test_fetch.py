@@ -113,9 +113,7 @@ async def test_a_vehicle_that_is_lost_after_its_hash_is_told_as_lost() -> None:
 @pytest.mark.parametrize("kind", ["px4", "ardupilot", "list"])
 @pytest.mark.parametrize("fetched_after", [None, 0.0, 0.02, 0.1])
 @virtual_on_both
-async def test_another_vehicle_at_the_address_is_fetched_whole(
-    kind: str, fetched_after: float | None
-) -> None:
+async def test_another_vehicle_at_an_address_is_fetched_whole(kind: str, fetched_after: float | None) -> None:
     """During the fetch, or some seconds before it."""
     first, other = two_vehicles(kind)
     place = Tap(Air.symmetric([first], delay=0.05))

@@ -46,9 +46,7 @@ async def test_reads_by_name_and_index_bring_the_vehicles_values(make: type[Vehi
 
 @EVERY
 @pytest.mark.parametrize("which", ["MC_ROLLP", 5000])
-async def test_silence_to_one_read_of_many_is_no_such_parameter(
-    make: type[Vehicle], which: str | int
-) -> None:
+async def test_silence_to_one_read_of_many_is_no_parameter(make: type[Vehicle], which: str | int) -> None:
     vehicle = make()
     async with talking(vehicle) as (_, session):
         await read(session, vehicle.listed[0].name)

@@ -255,9 +255,7 @@ MAKES = pytest.mark.parametrize(
 @virtual_on_both
 @MAKES
 @pytest.mark.parametrize("loss", [0.0, 0.2])
-async def test_a_reboot_happens_once_and_returns_when_the_vehicle_is_back(
-    make: type[Vehicle], loss: float
-) -> None:
+async def test_a_reboot_happens_once_and_waits_for_the_vehicle(make: type[Vehicle], loss: float) -> None:
     vehicle = make()
     async with converse(Air.symmetric([vehicle], loss=loss, delay=0.02, seed=5)) as conversation:
         node = await conversation.node()

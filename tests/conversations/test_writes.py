@@ -163,9 +163,7 @@ async def test_a_type_that_has_changed_is_taken_or_is_a_mismatch(value: int, fit
     ],
 )
 @pytest.mark.parametrize("order", ["E", "VE", "EV"])
-async def test_a_refusal_counts_beside_old_values(
-    code: int, kind: type[errors.ParamClientError], order: str
-) -> None:
+async def test_refusals_beat_old_values(code: int, kind: type[errors.ParamClientError], order: str) -> None:
     answers: dict[str, Message] = {
         "V": ParamValue("A", struct.pack("<i", 5), ParamType.INT32, 1, 0),
         "E": ParamError(255, 190, "A", -1, code),

@@ -79,9 +79,7 @@ def test_same_value_of_pairs(left: WrittenParam, right: WrittenParam, same: bool
 
 
 @given(SETS, SETS, st.none() | SETS)
-def test_a_comparison_is_complete_and_symmetric(
-    left: ParamSet, right: ParamSet, base: ParamSet | None
-) -> None:
+def test_comparison_is_complete_and_symmetric(left: ParamSet, right: ParamSet, base: ParamSet | None) -> None:
     there, back = compare(left, right, base=base), compare(right, left, base=base)
     assert [entry.name for entry in there.entries] == sorted(left.keys() | right.keys())
     for ours, theirs in zip(there.entries, back.entries, strict=True):

@@ -113,9 +113,7 @@ def test_four_bytes_round_trip(pattern: int) -> None:
         (ParamType.REAL32, "0000c040", 6.0, 0x40C00000),
     ],
 )
-def test_bytewise_encodes_the_value_in_the_first_bytes(
-    kind: ParamType, raw: str, value: float, bits: int
-) -> None:
+def test_bytewise_encodes_in_the_first_bytes(kind: ParamType, raw: str, value: float, bits: int) -> None:
     assert values.decode_value(bytes.fromhex(raw), kind, BYTEWISE) == (value, bits)
     assert values.encode_value(value, kind, BYTEWISE) == bytes.fromhex(raw)
 
@@ -139,9 +137,7 @@ def test_bytewise_encodes_the_value_in_the_first_bytes(
         *((kind, number, None) for kind in INTEGERS for number in (math.nan, math.inf, -math.inf)),
     ],
 )
-def test_c_cast_decodes_to_the_integer_or_stays_raw(
-    kind: ParamType, number: float, value: int | None
-) -> None:
+def test_c_cast_decodes_to_an_integer_or_stays_raw(kind: ParamType, number: float, value: int | None) -> None:
     raw = struct.pack("<f", number)
     read, bits = values.decode_value(raw, kind, C_CAST)
     if value is None:
