@@ -119,8 +119,7 @@ async def prove(session: Session) -> None:
             raise FileUnavailable(f"the checksum was refused: {error.reason}") from None
         except NoReply as error:
             session.ftp_unanswered += error.attempts
-            is_silent = session.serves_checksum is None
-            raise FileUnavailable(UNANSWERED, is_silent=is_silent) from None
+            raise FileUnavailable(UNANSWERED, is_silent=session.serves_checksum is None) from None
     raise TableDiffers(OTHER)
 
 
@@ -275,7 +274,7 @@ class _Proof:
         """Compare the time of the whole search with that of a download.
 
         Where most values are not simple, each part is divided until one row is left. Before the first
-        division, that is not known.
+        division, that is not known, and two rounds are likely.
 
         Raises:
             TableDiffers: the download is quicker.
@@ -283,7 +282,7 @@ class _Proof:
         trip, parts = self._round_trip, self._parts
         largest = max((len(each) for each in divided), default=0)
         is_narrow = 2 * largest < len(self._rows) and 2 * len(divided) > reads
-        depths = [math.ceil(math.log(len(each), parts)) if is_narrow else 1 for each in divided]
+        depths = [math.ceil(math.log(len(each), parts)) if is_narrow else 2 for each in divided]
         rounds = max(depths, default=bool(requests))
         requests += parts * (sum(depths) - len(depths))
         slots = 0.5 + reads // READS_PER_SLOT_ARDUPILOT

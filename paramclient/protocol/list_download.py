@@ -145,6 +145,8 @@ class _Download:
                 if self.session.only_by_index:
                     self._reading.add(1)
                     self.channel.send(dialect.request_read(target, 1))
+                    if self.table.is_growing:  # twice: the read ends the attempts, and shows no gap
+                        self.channel.send(dialect.request_list(target))
                 return dialect.request_list(target)
             which = int(attempt % 4 != 1)  # 1 is everywhere but where 0 is the only one
             self._reading.add(which)

@@ -476,9 +476,9 @@ async def _seek_evidence(session: Session) -> None:
                     channel.send(session.dialect.request_read(channel.reads_from, index))
                 if await channel.wait_for(inbox, lambda message: table.evidence or None, sent, 0, seconds):
                     return
-        if sum(moment >= began for moment in table.moments.values()) < EVIDENCE_READS:  # of few, or none
+        if table.is_complete and min(table.moments.values(), default=began) >= began:  # these were all
             return
-    with suppress(NoReply):  # it has no list either
+    with suppress(NoReply), anyio.move_on_after(2 * SETS_TIME):  # it has no list either
         await session.listing.join(lambda: download_list(session))
 
 

@@ -408,8 +408,9 @@ async def test_integers_in_another_encoding_are_told_and_not_written(
         assert not session.encoding_doubt
 
 
-async def test_a_list_in_progress_may_still_show_another_encoding() -> None:
-    table, serves = {"ZERO": (0.0, ParamType.INT32), **TABLE}, ("list", "sets", "acks")
+@pytest.mark.parametrize("serves", [("list", "sets", "acks"), ("list", "names", "sets", "acks")])
+async def test_a_list_in_progress_may_still_show_another_encoding(serves: tuple[str, ...]) -> None:
+    table = {"ZERO": (0.0, ParamType.INT32), **TABLE}
     vehicle = Partial(table, serves=serves, heartbeat=QUIET, encoding=Encoding.C_CAST)
     async with talking(Air.symmetric([vehicle], rate=1_000.0)) as (_, session):
         with pytest.raises(errors.UsageError, match=r"was not written.*--encoding c-cast"):
