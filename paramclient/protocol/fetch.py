@@ -312,9 +312,9 @@ def result_of(
 ) -> FetchResult:
     """Return the result of a fetch with the table as it is; of a partial one where it was ended."""
     channel, table, listed = session.channel, session.table, listed or ListResult()
-    cached, missing = table.unverified(began), {*table.missing(), *listed.missing}
+    cached, missing = dict.fromkeys(table.unverified(began)), {*table.missing(), *listed.missing}
     if policy is Policy.AUTO:
-        missing |= {index for name in cached if (index := table.params[name].index) is not None}
+        missing |= {index for index, name in table.names.items() if name in cached}
     return FetchResult(
         channel.system,
         channel.component,
