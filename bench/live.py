@@ -284,7 +284,7 @@ async def time_warm_start(
     if change is not None:
         async with ParamClient(vehicle.relay.link, cache=False) as client:
             await change(vehicle, seed, await client.component(vehicle.system, timeout=DISCOVERY_TIMEOUT))
-    vehicle.relay.change(replace(conditions, seed=seed))
+    vehicle.relay.change(replace(conditions, seed=seed, drops_telemetry=True))  # of which a burst may come
     async with ParamClient(vehicle.relay.link, cache=vehicle.warm) as client:
         component = await client.component(vehicle.system, timeout=DISCOVERY_TIMEOUT)
         await component.wait_until_identified(DISCOVERY_TIMEOUT)

@@ -469,7 +469,7 @@ class Component:
             self.watch.unconfirmed()
         elif result.complete:
             self.watch.fetched()
-            if self.node.generation != generation:
+            if self.node.generation != generation or (not result.cached and self.session.table.unverified()):
                 self.watch.doubt()
             else:
                 self.core.cache_writer.fetched(self.node, self.session, is_whole=result.source != "cache")

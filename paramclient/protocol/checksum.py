@@ -34,8 +34,8 @@ CHECKED_READ_SIZE: Final = 64
 """Bytes that ArduPilot reads at a time for a checksum: the padding of the file depends on it (measured)."""
 AT_ONCE: Final = 5
 """Requests sent at once: ArduPilot queues no more of them (GCS_FTP.cpp)."""
-INTERVAL_FIRST: Final = 0.020
-"""Seconds from these to the next request: a Plane and a Rover look for requests every 20 ms."""
+INTERVAL_FIRST: Final = 0.027
+"""Seconds from these to the next request: a Plane and a Rover look for requests every 20 ms (measured)."""
 INTERVAL: Final = 0.006
 """Seconds between further requests: ArduPilot loses some of those sent every 4 ms (measured)."""
 REQUEST_SIZE: Final = 65
@@ -105,8 +105,8 @@ async def prove(session: Session) -> None:
     async with session.channel.ftp:
         try:
             for _ in range(PROOFS_MAX):
-                proof, began = _Proof(session, _rows(session.table)), anyio.current_time()
-                is_at_once = await proof.run() or anyio.current_time() - began < RESTART_TIME
+                proof = _Proof(session, _rows(session.table))
+                is_at_once = await proof.run() or anyio.current_time() - proof.first < RESTART_TIME
                 if session.identification.vehicles != vehicles:
                     raise FileUnavailable("another vehicle has taken the address")
                 if proof.take_over() and is_at_once:
@@ -138,6 +138,7 @@ class _Proof:
         self._encoded: dict[range, list[bytes]] = {}  # the rows of a range, behind its header
         self._changed: dict[int, float] = {}  # by index, when the value was known
         self._refuted: set[tuple[int, int]] = set()  # wrong guesses
+        self.first = math.inf  # when the first checksum arrived
         self._round_trip = math.inf  # of the quickest requests
         self._byte_time = 0.0  # seconds for each byte of requests that waited for each other
         table, now = session.table, anyio.current_time()
@@ -159,11 +160,10 @@ class _Proof:
         Raises:
             TableDiffers: the tables are too different.
         """
-        rows, whole, repeats = self._rows, range(len(self._rows)), 0
+        rows, whole, repeats, suspects = self._rows, range(len(self._rows)), 0, set[int]()
         ends = {0, len(rows), *sorted(self._always)[:1], *(at + 1 for at in self._always)}
         between = {range(*each) for each in pairwise(sorted(ends))}
         await self._request(between | {range(at, at + 1) for at in self._alone})
-        suspects: set[int] = set()
         while places := self._differing():
             if len(places) > 1:
                 places.pop(whole, None)  # its parts say more
@@ -301,7 +301,7 @@ class _Proof:
         async def request(place: range) -> None:
             query = "" if place == whole else f"?start={place.start}&count={len(place)}"
             self._found[place] = await checksum(session.channel, PARAM_FILE + query, attempts=attempts)
-            session.serves_checksum = True
+            session.serves_checksum, self.first = True, min(self.first, anyio.current_time())
 
         async with task_group() as tasks:
             for number, place in enumerate(ranges):

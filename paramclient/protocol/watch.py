@@ -180,7 +180,7 @@ class Watch:
         if not answer.is_current:
             self._before, self._is_doubted = before, True
             if answer.is_other or answer.digest is not None:
-                table.doubt()
+                table.doubt(*table.names.values())
         if not answer.is_current or any(param.trust is Trust.CACHED for param in table.params.values()):
             result = await fetch_all(session, refresh=not answer.is_current)
             if not result.complete:

@@ -476,7 +476,7 @@ async def _seek_evidence(session: Session) -> None:
                     channel.send(session.dialect.request_read(channel.reads_from, index))
                 if await channel.wait_for(inbox, lambda message: table.evidence or None, sent, 0, seconds):
                     return
-        if table.is_complete and min(table.moments.values(), default=began) >= began:  # these were all
+        if session.serves_file or (table.is_complete and min(table.moments.values(), default=began) >= began):
             return
     with suppress(NoReply), anyio.move_on_after(2 * SETS_TIME):  # it has no list either
         await session.listing.join(lambda: download_list(session))

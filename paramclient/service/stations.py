@@ -50,7 +50,7 @@ REQUESTS_MAX: Final = 200
 link."""
 READS_AT_ONCE: Final = 3
 """Reads of one station that vehicles are asked for at once: fewer than an ArduPilot queues (20)."""
-SETS_AT_ONCE: Final = 60
+SETS_AT_ONCE: Final = 20
 """Sets likewise: bursts of 20 to a PX4 were all acknowledged (measured)."""
 SOURCES_MAX: Final = 64
 """Senders that are named of one station, at most."""

@@ -763,7 +763,7 @@ async def test_rule_4_sets_that_wait_for_others_are_not_refused() -> None:
     model = PX4Vehicle()
     names = [name for name, value in model.values.items() if isinstance(value, float)][:190]
     async with in_sync(Air.symmetric([model], delay=0.3)) as (_, _, station):
-        await station.ask(*(set_to(name, 3, ParamType.REAL32) for name in names), seconds=4.0)
+        await station.ask(*(set_to(name, 3, ParamType.REAL32) for name in names), seconds=7.0)
         assert not station.of(messages.ParamError)
         assert by_name(station).keys() >= {*names}
 
