@@ -469,6 +469,7 @@ class Component:
             self.watch.unconfirmed()
         elif result.complete:
             self.watch.fetched()
+            # or where values were doubted after they had arrived, as a reset passed
             if self.node.generation != generation or (not result.cached and self.session.table.unverified()):
                 self.watch.doubt()
             else:

@@ -209,8 +209,9 @@ async def read_many(session: Session, names: Iterable[str]) -> None:
 def is_stale(session: Session, name: str, age: float) -> bool:
     """Return whether a known value is older than so many seconds, not being read, and outside PX4's hash, so
     that nothing tells of a change."""
+    is_outside = session.identification.is_px4 and name in session.table.volatile
     is_old = anyio.current_time() - session.table.moments.get(name, math.inf) > age
-    return is_old and name in session.table.volatile and name not in session.reading
+    return is_outside and is_old and name not in session.reading
 
 
 async def read_again(session: Session, name: str, at: float) -> None:

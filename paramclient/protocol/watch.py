@@ -16,7 +16,7 @@ from paramclient.model.values import Param, Trust
 from paramclient.protocol.digest import ask, may_confirm
 from paramclient.protocol.fetch import Policy, differing, fetch_all
 from paramclient.protocol.presence import Presence
-from paramclient.protocol.reads import read_many
+from paramclient.protocol.reads import is_stale, read_many
 from paramclient.protocol.session import Session
 from paramclient.wire.messages import MAV_MODE_FLAG_SAFETY_ARMED
 
@@ -186,8 +186,7 @@ class Watch:
             if not result.complete:
                 return
         if answer.digest is not None:
-            old = anyio.current_time() - OUTSIDE_AGE
-            await read_many(session, [name for name in table.volatile if table.moments.get(name, old) < old])
+            await read_many(session, [key for key in table.volatile if is_stale(session, key, OUTSIDE_AGE)])
         self._is_doubted = False
         self.confirmed_at = anyio.current_time()
         changed = differing(before, table.params)

@@ -127,10 +127,10 @@ class Gateway:
         for station in self.stations:
             served = table if table is not None and self._serves(station, table, link) else None
             station.relay(seen, is_withheld=served is not None)
-            at, address, extended, answered = station.list_asked  # before the vehicle was heard
-            is_open = anyio.current_time() - at < TAKE_OVER_TIME and served not in answered
-            if served is not None and is_open and served in link.tables(*address, extended=extended):
-                answered.add(served)
+            at, address, extended, taken = station.list_asked  # before the vehicle was heard
+            is_new = served is not None and anyio.current_time() - at < TAKE_OVER_TIME and served not in taken
+            if is_new and served is not None and served in link.tables(*address, extended=extended):
+                taken.add(served)
                 served.send_list(station)
 
     def announce(self, link: VehicleLink, table: KeptTable, message: Message) -> None:
@@ -140,7 +140,7 @@ class Gateway:
                 station.say(message, table.source, is_answer=False)
 
     def doubt(self, system: int, *names: str, extended: bool = False) -> None:
-        """Doubt these values of a system, or all: a reset changes them, and PX4 does not announce it."""
+        """Doubt all values of a system, or those with these names: what changes them may not be announced."""
         for link in self.links:
             for table in link.tables(system, COMP_ID_ALL, extended=extended):
                 table.doubt(*names)

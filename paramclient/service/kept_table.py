@@ -372,7 +372,7 @@ class KeptTable(Stream[Change]):
         self.check()
         if value := self.known(which):
             asker.station.say(value, self.source)
-            if self.session.identification.is_px4 and is_stale(self.session, value.param_id, PROOF_AGE_MAX):
+            if is_stale(self.session, value.param_id, PROOF_AGE_MAX):
                 self.component.core.spawn(read_again, self.session, value.param_id, 0.0)
         elif self._is_unknown(which):
             self._refuse([asker], which, ParamErrorCode.DOES_NOT_EXIST)
