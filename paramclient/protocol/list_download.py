@@ -57,6 +57,8 @@ TIMES_MAX: Final = 3
 QUEUE_TIME: Final = 1.0
 """Seconds without a missing value after which no answer to a read waits behind others in the queue of a slow
 radio: PX4 fills that with its list within a second, at 57600 baud for 6 s, and answers reads behind it."""
+READS_AHEAD: Final = 4
+"""Indices behind the last that are read at once where no list is served."""
 ATTEMPTS_DOUBTFUL: Final = 3
 """Attempts to read the index 0 or one behind the last, where no list is served: others are answered."""
 GAPS_INTERVAL: Final = 0.02
@@ -280,12 +282,11 @@ class _Download:
             return timing.copies if self._is_over() and len(self._missing()) <= channel.window_size else 1
 
         def attempts_max() -> int:
-            return min(self._attempts_max(), most)
+            is_certain = self._is_served or 0 < index < (self._count or 0)
+            return min(self._attempts_max(), ATTEMPTS_MAX if is_certain else ATTEMPTS_DOUBTFUL)
 
-        request = dialect.request_read(channel.reads_from, index)
+        request, attempts = dialect.request_read(channel.reads_from, index), ATTEMPTS_MAX
         what = f"index {index} of {channel}"
-        is_doubtful = not self._is_served and not 0 < index < (self._count or 0)
-        attempts = most = ATTEMPTS_DOUBTFUL if is_doubtful else ATTEMPTS_MAX
         with channel.inbox((dialect.value, index)) as inbox:
             try:
                 await channel.exchange(
@@ -294,7 +295,7 @@ class _Download:
                 if not self._may_begin_again():  # else it may be of a list that runs again
                     self.session.serves_reads[int] = True
             except NoReply as error:
-                attempts = error.attempts if error.attempts < most else ATTEMPTS_MAX
+                attempts = error.attempts if attempts_max() == self._attempts_max() else ATTEMPTS_MAX
         await self._take_received()
         self._reading.discard(index)
         if index not in self._received:
@@ -309,13 +310,13 @@ class _Download:
     def _gaps(self) -> list[int]:
         """Return the indices to read: below the end of the list so far, or all that are missing.
 
-        The one behind the last is read too where the count may be false, or where they may begin at 1.
+        Those behind the last are read too where the count may be false, or where they may begin at 1.
         """
         if not self._is_over():
             return sorted(index for index in self._skipped if index <= self._reached - TAIL)
         gaps, count = set(self._missing()), self._count or 0
         if self.table.is_growing or not self._is_served:
-            gaps |= {0, count, count + (0 not in self._received)}
+            gaps |= {0, *range(count, count + (1 if self._is_served else READS_AHEAD))}
         elif 0 in gaps and self._is_given_up(0):
             gaps.add(count)
         return sorted(index for index in gaps - self._received if index < PARAMETERS_MAX)

@@ -86,9 +86,7 @@ def drawn(err: str) -> list[str]:
     return err.split("\r\x1b[K")[1:]
 
 
-def test_a_terminal_shows_what_is_awaited(
-    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_terminal_says_what_is_awaited(command: Command, put: Put, monkeypatch: pytest.MonkeyPatch) -> None:
     use_terminal(monkeypatch)
     texts = drawn(command("get", put(Station({}, system=252, component=190)), "A", "--timeout", 3.2).err)
     received = "Heard on sim:custom so far: only 252/190 ground station, an"
