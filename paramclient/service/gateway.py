@@ -317,7 +317,7 @@ class VehicleLink(Tap):
             return None
         tables = [self._table(node, extended=each) for each in (False, True)]  # from its first frame on
         is_extended = frame.message_id in EXTENDED_ANSWERS
-        is_for_us = _target_of(frame) == self._station.own_address[0]
+        is_for_us = frame.payload[1:3] == bytes(self._station.own_address)
         is_plain = frame.message_id in PLAIN_ANSWERS or (frame.message_id == FILE_TRANSFER and is_for_us)
         table = tables[is_extended]
         return table if (is_extended or is_plain) and table.withholds else None

@@ -1047,6 +1047,13 @@ async def test_rule_9_the_gateway_has_the_id_of_no_station() -> None:
         assert {frame.system for _, frame, _ in vehicle.received} == {252, 254}
 
 
+async def test_rule_9_a_companion_may_have_the_system_id_of_the_gateway() -> None:
+    async with in_sync(ArduPilotVehicle(), system=1) as (served, _, _):
+        companion = served.partner(system=1, component=9)
+        [answer] = await companion.ask_file(Opcode.OPEN_FILE_RO, data=b"nothing.txt")
+        assert answer.opcode == Opcode.NAK
+
+
 # 10: all components, and two vehicles with one id
 
 
