@@ -18,7 +18,7 @@ from paramclient.protocol.digest import Answer, ask, settle
 from paramclient.protocol.file_download import download_file
 from paramclient.protocol.ftp import SILENT_LOST
 from paramclient.protocol.list_download import ListResult, download_list
-from paramclient.protocol.reads import read_many
+from paramclient.protocol.reads import is_stale, read_many
 from paramclient.protocol.session import UNANSWERED, FileUnavailable, Session
 
 FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
@@ -216,9 +216,8 @@ class _Fetch:
             self.notes.append(UNCONFIRMED.format(answer.reason))
         if self.policy is Policy.HASH_ONLY:
             return self._unconfirmed()
-        self._ftp_is_silent = answer.is_silent
+        self._ftp_is_silent, digest = answer.is_silent, answer.digest
         source: FetchSource = "stream"
-        digest = answer.digest
         for _ in range(ROUNDS_MAX):
             if self.session.channel.is_silent(self._began):
                 break
@@ -275,7 +274,8 @@ class _Fetch:
 
     async def _read_unverified(self) -> None:
         """Read the values that the digest does not cover."""
-        names = self.table.unverified()
+        outside = (name for name in self.table.volatile if is_stale(self.session, name, 0.0))
+        names = dict.fromkeys([*self.table.unverified(), *outside])
         await read_many(self.session, names)
         if left := [name for name in names if self.table.moments.get(name, math.inf) < self._began]:
             self.notes.append(NOT_READ.format(first_of(left, SHOWN_MAX)))

@@ -359,9 +359,7 @@ def test_a_failed_vehicle_does_not_stop_the_others(command: Command, put: Put, f
     assert [each["system"] for each in reported["errors"]] == [2]
 
 
-def test_one_file_or_state_for_all_vehicles_is_refused(
-    command: Command, put: Put, file: File, tmp_path: Path
-) -> None:
+def test_one_file_for_all_vehicles_is_refused(command: Command, put: Put, file: File, tmp_path: Path) -> None:
     air, vehicles = fleet()
     every, one_id = ["--vehicle", "all"], file("SYSID_THISMAV,7\n", "id.param")
     file("RTL_ALT,3\n", "1.param")

@@ -77,9 +77,7 @@ def test_save_writes_what_differs(command: Command, put: Put, tmp_path: Path) ->
     assert list(read_file(tmp_path / "part.parm").choose(None)) == ["MC_PITCH_P"]
 
 
-def test_a_comparison_with_the_defaults_takes_those_of_the_metadata(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
+def test_defaults_in_a_comparison_are_of_the_metadata(command: Command, put: Put, tmp_path: Path) -> None:
     file = tmp_path / "tuned.parm"
     file.write_text("MC_ROLL_P,4\nMC_PITCH_P,7\n")
     assert command("fetch", put(quad()), "--json").code == 0  # loads no metadata

@@ -220,6 +220,15 @@ async def test_a_hash_that_is_refused_for_any_reason_is_no_hash(code: ParamError
             check_right(vehicle, await fetch_all(session))
 
 
+async def test_a_value_outside_the_hash_is_read_in_each_fetch() -> None:
+    vehicle = PX4Vehicle()
+    name = next(row.name for row in px4_table() if row.volatile)
+    async with talking(vehicle) as (_, session):
+        await fetch_all(session)
+        vehicle.load({name: 9.5})
+        assert (await fetch_all(session)).params[name].value == 9.5
+
+
 async def test_a_value_outside_the_hash_that_is_not_received_is_missing() -> None:
     vehicle = PX4Vehicle()
     secret = vehicle.param(next(row.name for row in px4_table() if row.volatile))

@@ -66,9 +66,7 @@ class Recorded(Puppet):
     ("name", "table", "digest"),
     [("px4_full_download", px4_table(), PX4_HASH), ("ardupilot_full_download", ardupilot_table(), None)],
 )
-async def test_a_list_is_complete_and_its_hash_is_proven(
-    name: str, table: list[SimParam], digest: int | None
-) -> None:
+async def test_a_list_and_its_hash_are_proven(name: str, table: list[SimParam], digest: int | None) -> None:
     async with talking(Recorded(name)) as (conversation, session):
         session.serves_file = False
         result = await fetch_all(session)
