@@ -405,7 +405,7 @@ def update_of(
         complete=table.is_complete,
         volatile_known=table.volatile_is_known,
         synced_at=record.synced_at if record.fetched_at is None else record.fetched_at + ahead,
-        file_works=session.serves_file,
+        file_works=session.serves_file or (None if session.ftp_unanswered else session.serves_file),
     )
     return TableUpdate(
         identity=identity,

@@ -17,7 +17,7 @@ from paramclient.protocol.session import FileUnavailable, Session
 from paramclient.wire.messages import HASH_CHECK
 
 CHANGED_MEANWHILE: Final = "The parameters changed during the download: the table may be a mixture."
-NO_CHECKSUM: Final = "the vehicle computes no checksum of its table"
+NO_CHECKSUM: Final = "the vehicle serves no file of its parameters, or no checksum of it"
 UNPROVEN: Final = "The vehicle's hash could not be computed from the table; it was equal before and after."
 
 

@@ -281,7 +281,7 @@ class _Download:
         def copies(attempt: int) -> int:
             return timing.copies if self._is_over() and len(self._missing()) <= channel.window_size else 1
 
-        def attempts_max() -> int:
+        def most() -> int:
             is_certain = self._is_served or 0 < index < (self._count or 0)
             return min(self._attempts_max(), ATTEMPTS_MAX if is_certain else ATTEMPTS_DOUBTFUL)
 
@@ -289,13 +289,11 @@ class _Download:
         what = f"index {index} of {channel}"
         with channel.inbox((dialect.value, index)) as inbox:
             try:
-                await channel.exchange(
-                    request, inbox, accept, what=what, attempts=attempts_max, copies=copies
-                )
+                await channel.exchange(request, inbox, accept, what=what, attempts=most, copies=copies)
                 if not self._may_begin_again():  # else it may be of a list that runs again
                     self.session.serves_reads[int] = True
             except NoReply as error:
-                attempts = error.attempts if attempts_max() == self._attempts_max() else ATTEMPTS_MAX
+                attempts = error.attempts if most() == self._attempts_max() else ATTEMPTS_MAX
         await self._take_received()
         self._reading.discard(index)
         if index not in self._received:

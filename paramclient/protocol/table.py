@@ -196,7 +196,7 @@ class Table:
             if 0 < count <= PARAMETERS_MAX and count != self._false_count:
                 self.recount(count)
             return None
-        count, before = min(count, PARAMETERS_MAX), self.count or 0
+        count, before = count if count <= PARAMETERS_MAX else 0, self.count or 0
         is_beyond = index > count or (index == count and (0 in self.names or index == 0))
         if is_beyond or (index == 0 and count == before and count in self.names):
             known = self.params.get(name)
@@ -300,7 +300,7 @@ class Table:
         self._outdated.clear()
         for name in gone:
             self._report(Change(name, self._drop(name), None, "vehicle", "removed"))
-        self._hash_is_stale = self._hash is not None
+        self._invalidate_hash()
 
     def _drop(self, name: str) -> Param:
         self.moments.pop(name, None)
@@ -333,8 +333,7 @@ class Table:
         self.params[name] = new
         if old is not None and old.same_value(new):
             return
-        if self._hash is not None:
-            self._invalidate_hash(name)
+        self._invalidate_hash(name)
         by = self.author_of(name)
         if old is not None:
             self._report(Change(name, old, new, by, "changed"))
@@ -476,8 +475,8 @@ class Table:
         """Forget the hash: none is known to belong to this table."""
         self._hash, self._hash_is_stale = None, False
 
-    def _invalidate_hash(self, name: str) -> None:
+    def _invalidate_hash(self, name: str = "") -> None:
         if not self.volatile_is_known:
             self.unconfirm()
         elif name not in self.volatile:
-            self._hash_is_stale = True
+            self._hash_is_stale = self._hash is not None

@@ -433,8 +433,8 @@ async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Pa
     assert said(path) == (0, None)
 
 
-@pytest.mark.parametrize("kind", ["no file", "silent"])
-async def test_vehicle_without_parameter_file_is_remembered_for_its_firmware(path: Path, kind: str) -> None:
+@pytest.mark.parametrize(("kind", "why"), [("no file", "no file of its"), ("silent", "did not answer")])
+async def test_that_there_is_no_file_is_remembered_but_no_silence(path: Path, kind: str, why: str) -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     server = vehicle.file_server
     assert server is not None
@@ -447,15 +447,15 @@ async def test_vehicle_without_parameter_file_is_remembered_for_its_firmware(pat
     first = await session(requested, path)
     assert (first.source, first.complete) == ("stream", True)
     assert "Downloaded as a list" in first.notes[0]
-    assert said(path)[1] is False
+    assert said(path)[1] is (None if kind == "silent" else False)
     assert requested.messages(messages.FileTransfer)
     requested.received.clear()
     second = await session(requested, path)
     assert second.source == "stream"
-    assert ["computes no checksum" in note for note in second.notes] == [True]
-    assert not requested.messages(messages.FileTransfer)
+    assert [why in note for note in second.notes] == [True]
+    assert bool(requested.messages(messages.FileTransfer)) == (kind == "silent")
     vehicle.file_server, server.params = server, rows
-    assert (await session(requested, path)).source == "stream", "nothing was requested"
+    assert (await session(requested, path)).source == {"no file": "stream", "silent": "cache"}[kind]
     vehicle.version = replace(vehicle.version, flight_sw_version=67502081)
     assert (await session(requested, path)).source == "ftp"
     assert said(path)[1] is True
