@@ -209,12 +209,13 @@ class Component:
 
     @property
     def is_armed(self) -> bool | None:
-        """Whether the vehicle is armed, from `base_mode` of its last heartbeat.
+        """Whether the vehicle is armed, from `base_mode` of its last heartbeat; of its autopilot's where the
+        component sends none.
 
         None if unknown: before the first heartbeat, while the component is lost, and in high-latency mode, in
         which a vehicle sends no heartbeats.
         """
-        presence = self.node.presence
+        presence = (self.node if self.node.presence.has_beaten else self.vehicle).presence
         if presence.base_mode is None or presence.is_lost:
             return None
         return bool(presence.base_mode & MAV_MODE_FLAG_SAFETY_ARMED)

@@ -7,6 +7,7 @@ import pytest
 from paramclient import ParamSet, UsageError, VehicleArmed
 from paramclient.provision import apply
 from paramclient.sim import Air, Camera, PX4Vehicle
+from tests.conversations.partial import Partial
 from tests.shell import a_client
 
 
@@ -28,6 +29,12 @@ async def test_a_set_of_another_component_or_kind_is_refused() -> None:
         ):
             with pytest.raises(UsageError, match=why):
                 await apply(target, wanted)
+
+
+async def test_a_node_without_heartbeat_is_armed_as_its_autopilot() -> None:
+    node = Partial(heartbeat=None, component=25)
+    async with a_client(Air.symmetric([PX4Vehicle(table={"A": 1}), node])) as client:
+        assert (await apply(await client.component(1, 25), {"MODE": 2})).complete
 
 
 async def test_nothing_is_set_on_the_camera_of_an_armed_vehicle_unless_allowed() -> None:
