@@ -427,7 +427,7 @@ class _Job:
             end = f"{', rebooted' * bool(found.reboots)} in {found.elapsed:.1f} s"
             made, late = found.plan, found.reboot_required
             if found.error is not None:
-                remarks.append(f"{found.error}; {self.state.to_continue}")
+                remarks.append(f"{found.error}".rstrip(".") + f"; {self.state.to_continue}")
                 code = max(code, code_of(found.error))
         else:
             say(f"{session.receiver}: {words or 'nothing acknowledged'}; {self.state.to_continue}")

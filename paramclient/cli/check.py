@@ -192,7 +192,7 @@ class _Check:
         words = f"{found['before']}, {proof.size} bytes in {milliseconds(found['elapsed_s'] or 0.0)}"
         self.rows.append(("checksum" if is_ardupilot else "hash", f"none: {problem}" if problem else words))
         if problem and component.autopilot == "px4":
-            self.findings.append(("slow", f"{problem}: each session downloads. Set MAV_HASH_CHK_EN to 1."))
+            self.findings.append(("slow", "Without a hash, sessions download. Set MAV_HASH_CHK_EN to 1."))
 
     async def _list(self) -> None:
         """Measure one list download, also if a file download would be faster."""

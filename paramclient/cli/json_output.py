@@ -165,10 +165,8 @@ def origin_json(params: ParamSet) -> JsonObject:
 
 def set_json(params: ParamSet, metadata: Metadata | None = None, *, whole: bool = False) -> JsonObject:
     """Return a set with its parameters by name; with `whole`, with all their metadata."""
-    written = {
-        name: written_json(each, info_of(metadata, name), whole=whole) for name, each in params.items()
-    }
-    return {**origin_json(params), "params": written}
+    values = {name: written_json(each, info_of(metadata, name), whole=whole) for name, each in params.items()}
+    return {**origin_json(params), "params": values}
 
 
 # Fetches and writes

@@ -132,12 +132,12 @@ def _report_fetch(session: CommandSession, result: FetchResult, errors: Collecti
     for note in result.notes:
         report(f"{session.prefix}{note}")
     if not session.options.json:
-        of = f" of {result.count}" if result.missing else ""
+        of = f"{result.received} of " if result.missing else ""
         crc = "" if result.hash is None else f"; hash {hash_text(result.hash)}"
         lost = "" if result.source == "cache" else f"{result.lost} lost, {result.repeated} repeated, "
         trip = "" if result.round_trip is None else f"round trip {output.milliseconds(result.round_trip)}, "
         link = " on the whole link" if len(client.components) > 1 else ""
-        fetched = f"{result.received}{of} {noun_of(session.component)}s of {label} from {result.source}"
+        fetched = f"{of}{counted(result.count, noun_of(session.component))} of {label} from {result.source}"
         traffic = f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent{link}"
         say(f"{fetched} in {result.elapsed:.2f} s, {lost}{trip}{traffic}{crc}")
     return max(report_all(errors, session.prefix), session.report_missing(result.missing))

@@ -139,10 +139,8 @@ class CommandSession:
 
     @property
     def label(self) -> str:
-        """The component in words: `1/1 px4`; one that names no autopilot by its kind: `1/100 camera`."""
-        autopilot = self.component.autopilot
-        is_named = autopilot not in ("unknown", "no autopilot", "generic")
-        return f"{self.address} {autopilot}" if is_named else node_in_words(self.component.node)
+        """The component in words: `1/1 PX4 quadrotor`."""
+        return node_in_words(self.component.node)
 
     @property
     def others(self) -> list[str]:
@@ -165,9 +163,9 @@ class CommandSession:
     @property
     def receiver(self) -> str:
         """Address, kind and firmware of the component: `1/1 PX4 quadrotor, firmware 1.16.0`."""
-        firmware = self.component.identity.firmware
+        firmware = self.component.node.identification.identity.firmware
         version = f", firmware {version_text(firmware)}" if firmware else ""
-        return f"{node_in_words(self.component.node)}{version}"
+        return f"{self.label}{version}"
 
     async def fetch(self, *, refresh: bool = False) -> FetchResult:
         """Fetch the table; after an interruption, print what was received and kept."""
@@ -328,14 +326,20 @@ async def sessions(
     async with open_client(link, options, cache=options.place, **more) as client:
         if choice.is_all:
             with _waiting(client, "vehicles"):
-                found = await client.find_autopilots(timeout=deadline.heartbeat_timeout)
+                try:
+                    found = await client.find_autopilots(timeout=deadline.heartbeat_timeout)
+                except NoReply:
+                    if not client.components or (writes and not options.extended):
+                        raise
+                    found = []
             known = [each for each in client.components.values() if each.node.identification.has_parameters]
             if options.extended:
                 found = await _with_parameters([each.ext for each in known])
             elif not (writes or client.listens_only):
                 found += await _with_parameters([each for each in known if each not in found])
             if not found:
-                raise NoReply("a component with extended parameters", attempts=0, waited=OTHERS_TIMEOUT)
+                what = f"a component with {'extended ' * options.extended}parameters"
+                raise NoReply(what, attempts=0, waited=OTHERS_TIMEOUT)
         else:
             found = [await wait_for_vehicle(client, choice, deadline, only=writes)]
             found = [each.ext for each in found] if options.extended else found
@@ -374,8 +378,7 @@ async def _with_parameters(components: Sequence[Component]) -> list[Component]:
     for each in components:
         if each.count is None:
             hint = "" if each.is_extended else "; --extended uses extended ones"
-            none = f"has no {noun_of(each)}s, or none within {OTHERS_TIMEOUT:g} s"
-            say(f"{node_in_words(each.node)} {none}{hint}")
+            say(f"{node_in_words(each.node)} has no {noun_of(each)}s, or none in {OTHERS_TIMEOUT} s{hint}")
     return [each for each in components if each.count is not None]
 
 

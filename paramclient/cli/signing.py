@@ -104,8 +104,7 @@ async def _change(
             requests = "unsigned requests" if key is None else "requests signed with the key, or unsigned"
             raise VehicleError(f"{name} does not answer {requests}: {error}", *address) from None
         if key is None and _count_signed(client, address) > before:
-            failure = "still signs; it may require its present key, see --signing-key"
-            raise VehicleError(f"{name} {failure}", *address)
+            raise VehicleError(f"{name} still signs; it may require its old key, see --signing-key", *address)
     found = taken(vehicle, "system", "component", "autopilot")
     found |= {"signs": key is not None, "fingerprint": key and key.fingerprint}
     state = "no longer signs" if key is None else f"signs with the key {key.fingerprint} now"

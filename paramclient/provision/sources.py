@@ -262,9 +262,8 @@ def fetched_set(component: Component, result: FetchResult, *, source: str, parti
     indices = sorted({*result.missing, *(index for index in cached if index is not None)})
     missing = [cached.get(index, f"index {index}") for index in indices]
     if missing and not partial:
-        who = f"{component.system}/{component.component} {component.autopilot} on {component.identity.link}"
         was = f"{first_of(missing, NAMES_SHOWN_MAX)} {'was' if len(missing) == 1 else 'were'} not received"
-        raise _incomplete(who, was, component.system, component.component)
+        raise _incomplete(was, component.system, component.component)
     known = [name for name in result.params if name not in result.cached]
     return part_set(component, [result.params[name] for name in known], source, missing)
 
@@ -282,8 +281,9 @@ def part_set(component: Component, params: Collection[Param], source: str, lacks
     return component_set(component, params, source, words if names else "")
 
 
-def _incomplete(who: str, what: str, *ids: int) -> VehicleError:
-    return VehicleError(f"{who} is incomplete: {what}; save and diff take it with --incomplete", *ids)
+def _incomplete(why: str, system: int, component: int) -> VehicleError:
+    what = f"{system}/{component} is incomplete: {why}; save and diff take it with --incomplete"
+    return VehicleError(what, system, component)
 
 
 def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> ParamSet:
@@ -293,13 +293,13 @@ def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> Par
         VehicleError: the cache has not all of them, and `partial` is false.
     """
     lacks = ""
-    if not table.complete:
+    if not table.complete or table.size < (table.count or 0):
         of = "" if table.count is None else f" of {table.count}"
         others = sum(param.index is None for param in table.params.values()) if of else 0
         lacks = f"{table.size - others}{of} parameters are in the cache"
         lacks += f", and {others} read by name" if others else ""
-        if not partial:
-            raise _incomplete(f"{table.system}/{table.component}", lacks, table.system, table.component)
+        if not (table.complete or partial):
+            raise _incomplete(lacks, table.system, table.component)
     at, source = table.updated_at if table.synced_at is None else table.synced_at, f"cache {table.key}"
     return ParamSet(table.params, table.component, table.system, table.identity, at, source, extended, lacks)
 

@@ -74,8 +74,8 @@ def test_apply_sets_and_verifies_values_that_differ(command: Command, put: Put, 
     assert announced == f"writing to {RECEIVER} on udpin:0.0.0.0:14550"
     assert re.fullmatch(rf"{RECEIVER}: 2 accepted, 1 unchanged, 1 skipped in \d\.\d s", line)
     assert notes == [
-        "1/1 ardupilot: ranges not checked: 2 of 2 have no metadata",
-        "1/1 ardupilot: left out: 1 calibration; to write them: --include calibration",
+        "1/1 ArduPilot quadrotor: ranges not checked: 2 of 2 have no metadata",
+        "1/1 ArduPilot quadrotor: left out: 1 calibration; to write them: --include calibration",
     ]
     assert (vehicle.values["RTL_ALT"], vehicle.values["COMPASS_OFS_X"]) == (2500, 5.0)
     again = command("apply", put(vehicle), file())
@@ -132,7 +132,7 @@ def test_armed_vehicles_are_refused(command: Command, put: Put, file: File) -> N
     assert (outcome.code, outcome.out, vehicle.requests["PARAM_SET"]) == (1, "", 0)
     assert ("armed" in outcome.err, "writing to" in outcome.err) == (True, False)
     would = command("apply", put(vehicle), file(), "--dry-run")
-    assert (would.code, "1/1 ardupilot: armed; nothing would be set now" in would.err) == (1, True)
+    assert (would.code, "1/1 ArduPilot quadrotor: armed; nothing would be set now" in would.err) == (1, True)
     assert command("apply", put(vehicle), file(), "--dry-run", "--allow-armed").code == 0
     assert command("apply", put(vehicle), file(), "--allow-armed").code == 0
 
@@ -141,7 +141,7 @@ def test_the_vehicle_reboots_only_with_the_option(command: Command, put: Put, fi
     wanted = file("EK2_ENABLE,1\nEK2_GPS_TYPE,3\n")
     outcome = command("apply", put(vehicle := copter()), wanted)
     assert (outcome.code, vehicle.values["EK2_GPS_TYPE"]) == (0, 3)
-    assert "1/1 ardupilot: takes effect after a reboot: EK2_ENABLE\n" in outcome.err
+    assert "1/1 ArduPilot quadrotor: takes effect after a reboot: EK2_ENABLE\n" in outcome.err
     outcome = command("apply", put(copter()), wanted, "--reboot", "--json")
     assert (outcome.code, outcome.json["reboots"], outcome.json["reboot_required"]) == (0, 1, [])
     assert outcome.err == "", "the object has the summary"
@@ -175,7 +175,7 @@ def test_dry_run_prints_the_stages_in_order(command: Command, put: Put, file: Fi
     assert outcome.code == 0
     purpose = "switches that reveal parameters, takes effect after a reboot"
     assert outcome.rows[1] == ["EK2_ENABLE", "0", "1", "set", purpose]
-    assert "1/1 ardupilot: takes effect after a reboot: EK2_ENABLE\n" in outcome.err
+    assert "1/1 ArduPilot quadrotor: takes effect after a reboot: EK2_ENABLE\n" in outcome.err
     assert [row[0] for row in outcome.rows[2:]] == ["RTL_ALT", "WPNAV_SPEED", "COMPASS_OFS_X", "EK2_NO_SUCH"]
     assert "; nothing was sent\n" in outcome.err
     assert (vehicle.requests["PARAM_SET"], backup.exists()) == (0, False)
@@ -233,7 +233,7 @@ def test_a_backup_restores_the_calibration_of_the_very_same_vehicle(
     for foreign in (anonymous, several):
         left_out = command("restore", put(vehicle), foreign)
         assert (left_out.code, " of 1/? from" in left_out.err) == (0, False)
-        said = "1/1 ardupilot: left out: 1 calibration; to write them: --include calibration\n"
+        said = "1/1 ArduPilot quadrotor: left out: 1 calibration; to write them: --include calibration\n"
         assert said in left_out.err
         assert vehicle.values["COMPASS_OFS_X"] == 9.0
     for words in ([named], [copied], [two], [anonymous, "--vehicle", f"uid:{named.stem}"]):
@@ -336,7 +336,7 @@ def test_all_vehicles_are_set_and_restored_each_with_its_own_values(
     assert [line for line in lines if line.startswith("writing")] == announced
     assert [line.split(":")[0] for line in lines if " accepted" in line] == receivers
     back = command("restore", put(air), "--vehicle", "all")
-    assert (back.code, back.err.count("/1 ardupilot: the state is that before the last apply, ")) == (0, 3)
+    assert (back.code, back.err.count("quadrotor: the state is that before the last apply, ")) == (0, 3)
     assert [vehicle.values for vehicle in vehicles] == [copter().values] * 3
     vehicles = [restarted(vehicle) for vehicle in vehicles]
     air = Air(vehicles)
@@ -352,7 +352,7 @@ def test_a_failed_vehicle_does_not_stop_the_others(command: Command, put: Put, f
     air, vehicles = fleet()
     vehicles[1].armed = True
     outcome = command("apply", put(air), file(), "--vehicle", "all")
-    assert (outcome.code, "2/1 ardupilot: " in outcome.err) == (1, True)
+    assert (outcome.code, "2/1 ArduPilot quadrotor: " in outcome.err) == (1, True)
     assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [2500, 1500, 2500]
     reported = command("apply", put(air), file(), "--vehicle", "all", "--json").json
     assert [each["system"] for each in reported["vehicles"]] == [1, 3]

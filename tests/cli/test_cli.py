@@ -134,7 +134,7 @@ def test_fetch_prints_a_table_and_a_summary(command: Command, warm: Path) -> Non
     volatile = {row.name for row in px4_table() if row.volatile}
     assert {name for name, row in by_name.items() if row[-1] == "live"} == volatile
     assert re.fullmatch(
-        r"903 parameters of 1/1 px4 from cache in [0-9.]+ s, round trip [0-9.]+ ms, "
+        r"903 parameters of 1/1 PX4 quadrotor from cache in [0-9.]+ s, round trip [0-9.]+ ms, "
         r"[0-9,]+ bytes received, [0-9,]+ sent; "
         rf"hash {HASH}\n",
         fetched.err,
@@ -190,7 +190,7 @@ def test_numbers_are_parsed_exactly(command: Command, put: Put, name: str, text:
     assert vehicle.values[name] == held
 
 
-def test_fetch_names_what_has_changed_since_an_ardupilot_was_cached(
+def test_fetch_names_changes_since_an_ardupilot_was_cached(
     command: Command, put: Put, tmp_path: Path
 ) -> None:
     vehicle = ArduPilotVehicle()
@@ -209,7 +209,7 @@ def test_fetch_names_what_has_changed_since_an_ardupilot_was_cached(
 
 def test_watch_prints_lines_of_json_as_values_change(live_command: Command, tmp_path: Path) -> None:
     with simulated("px4") as url, process("watch", url, "MC_ROLL_P", "--json", "--no-cache") as watching:
-        assert line_of(watching.stderr) == "watching MC_ROLL_P of 1/1 px4\n"
+        assert line_of(watching.stderr) == "watching MC_ROLL_P of 1/1 PX4 quadrotor\n"
         done = live_command("set", url, "MC_PITCH_P", 7, "MC_ROLL_P", "nan", "--force", "--no-cache")
         assert done.code == 0
         change = strict(line_of(watching.stdout))
@@ -242,7 +242,7 @@ class Restless(PX4Vehicle):
 
 def test_watch_prints_events_of_the_vehicle(command: Command, put: Put) -> None:
     printed = command("watch", put(Restless(table={"A": 1, "B": 2})), "--no-cache", "--timeout", 20, "--json")
-    assert (printed.code, printed.err) == (0, "watching 2 parameters of 1/1 px4\n")
+    assert (printed.code, printed.err) == (0, "watching 2 parameters of 1/1 PX4 quadrotor\n")
     lines = [strict(line) for line in printed.out.splitlines()]
     for each in lines:
         datetime.fromisoformat(each.pop("time"))
@@ -260,7 +260,7 @@ def test_watch_prints_events_of_the_vehicle(command: Command, put: Put) -> None:
 
 def test_watch_does_not_count_the_parameters_of_a_log_before_it_is_read(command: Command) -> None:
     watched = command("watch", f"replay:{ROOT}/tests/data/px4_20_sets.tlog?speed=0", "--no-cache")
-    assert (watched.code, watched.err) == (0, "watching all parameters of 1/1 px4\n")
+    assert (watched.code, watched.err) == (0, "watching all parameters of 1/1 PX4 quadrotor\n")
 
 
 def test_a_name_that_a_log_does_not_have_is_named(command: Command) -> None:
@@ -275,7 +275,7 @@ def test_a_link_that_fails_during_watch_is_reported_once(command: Command, put: 
 
     watched = command("watch", put(Eventful(PX4Vehicle(table={"A": 1}), (9.0, fail))), "A", "--no-cache")
     assert (watched.code, watched.out) == (4, "")
-    assert watched.err == "watching A of 1/1 px4\nparamclient: it is gone\n"
+    assert watched.err == "watching A of 1/1 PX4 quadrotor\nparamclient: it is gone\n"
 
 
 # link
@@ -356,9 +356,7 @@ def test_a_failed_link_is_exit_code_4(live_command: Command, put: Put) -> None:
     assert found == [("unknown", "LinkError"), ("not tried", "LinkError")]
 
 
-def test_a_failed_cache_is_exit_code_5_and_only_a_warning_for_fetch(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
+def test_a_failed_cache_is_code_5_and_a_warning_for_fetch(command: Command, put: Put, tmp_path: Path) -> None:
     for arguments in (["show"], ["show", "--json"], ["cache", "list"], ["history", "1"]):
         outcome = command(*arguments, "--cache", tmp_path)
         assert (outcome.code, outcome.out) == (5, "")
@@ -402,7 +400,7 @@ def test_ctrl_c_during_a_fetch_says_what_was_received_and_kept(
     done = command("fetch", put(vehicle), *cache)
     assert (done.code, done.out) == (130, "")
     where = "kept in the cache" if kept else "not kept, without a cache"
-    said = rf"interrupted: ([0-9]+) of 903 parameters of 1/1 px4 received and {where}\n"
+    said = rf"interrupted: ([0-9]+) of 903 parameters of 1/1 PX4 quadrotor received and {where}\n"
     assert (found := re.fullmatch(said, done.err))
     if kept:
         assert command("cache", "list", *cache, "--json").json["components"][0]["size"] == int(found[1]) > 0
@@ -564,15 +562,15 @@ def test_a_rate_is_that_of_a_while(command: Command, monkeypatch: pytest.MonkeyP
     file = tmp_path / "quad.parm"
     file.write_text("MC_ROLL_P 6\nMC_YAW_P 2\n")
     shown = command("apply", "sim:px4?rate=10000", file, "--dry-run", "--no-cache").err
-    assert "\x1b[Kreading 1/1 px4 (" in shown
+    assert "\x1b[Kreading 1/1 PX4 quadrotor (" in shown
     shown = command("apply", "sim:px4?rate=10000", file, "--yes", "--no-cache").err
-    assert "\x1b[Ksetting 1/1 px4 2/2\r" in shown, "without the rate of two at once"
+    assert "\x1b[Ksetting 1/1 PX4 quadrotor 2/2\r" in shown, "without the rate of two at once"
 
 
 def test_progress_is_drawn_on_a_terminal(tmp_path: Path) -> None:
     shown = on_terminal("fetch", "sim:px4", "--no-cache")
     assert shown.code == 0
-    assert re.search(r"fetching 1/1 px4 .*[0-9]+/903 [0-9]+/s, [0-9]+ s left", shown.out)
+    assert re.search(r"fetching 1/1 PX4 quadrotor .*[0-9]+/903 [0-9]+/s, [0-9]+ s left", shown.out)
     assert "\x1b[1m" in shown.out  # the heading of the table
     assert "\r\x1b[K\x1b[1mname" in shown.out  # the line is erased before the table
 

@@ -28,7 +28,7 @@ def quad(*, metadata: bool = True, **options: Any) -> PX4Vehicle:
 def test_fetch_compares_with_the_metadata_of_the_vehicle(command: Command, put: Put) -> None:
     done = command("fetch", put(quad()), "--changed", "--metadata", "vehicle")
     assert (done.code, done.rows[1:]) == (0, [["MC_ROLL_P", "6.25", "REAL32", "3", "live", "4.0"]]), done.err
-    assert "1/1 px4: 1 of 1 default from the metadata of the firmware" in done.err
+    assert "1/1 PX4 quadrotor: 1 of 1 default from the metadata of the firmware" in done.err
 
 
 def test_without_changed_nothing_is_requested_for_defaults(command: Command, put: Put) -> None:

@@ -31,7 +31,7 @@ def test_get_and_set(command: Command, put: Put) -> None:
     done = command(
         "set", url, *CAMERA, "CAM_NAME", "-Rear-", "CAM_MODE=0x10", "CAM_KEY", "hex:00ff", "CAM_EV", 1
     )
-    assert done.code == 0, done.err
+    assert (done.code, done.err) == (0, "1/100 camera: 4 accepted\n")
     assert done.rows[1:] == [
         ["CAM_NAME", "-Rear-", "-Rear-", "accepted"],
         ["CAM_MODE", "16", "16", "accepted"],
@@ -144,6 +144,11 @@ def test_all_are_those_that_have_some(command: Command, put: Put) -> None:
     url = put(Air.symmetric([PX4Vehicle(table={"A": 1}), small()]))
     fetched = command("fetch", url, "--vehicle", "all", "--extended", "--json")
     assert (fetched.code, [each["component"] for each in fetched.json["vehicles"]]) == (0, [100])
-    assert fetched.err.startswith("1/1 PX4 quadrotor has no extended parameters, or none within 2.5 s\n")
+    assert fetched.err.startswith("1/1 PX4 quadrotor has no extended parameters, or none in 2.5 s\n")
+    alone = command("fetch", put(small()), "--vehicle", "all", "--extended")
+    assert (alone.code, alone.err.startswith("4 extended parameters of 1/100 camera from stream ")) == (
+        0,
+        True,
+    )
     none = command("fetch", put(PX4Vehicle(table={"A": 1})), "--vehicle", "all", "--extended")
     assert (none.code, "a component with extended parameters" in none.err) == (3, True)

@@ -110,7 +110,7 @@ def test_a_first_command_suggests_names_but_not_over_a_slow_link(command: Comman
 def test_a_text_that_is_neither_a_number_nor_a_known_name_is_quoted(command: Command) -> None:
     outcome = command("set", "sim:px4", "MC_ROLL_P=6,5")
     assert outcome.code == 2
-    assert "'6,5' is not a number. 1/1 px4 does not describe its parameters" in outcome.err
+    assert "'6,5' is not a number. 1/1 PX4 quadrotor does not describe its parameters" in outcome.err
     assert "https://autotest.ardupilot.org/Parameters/" in outcome.err
 
 

@@ -95,14 +95,12 @@ def test_a_terminal_says_what_is_awaited(command: Command, put: Put, monkeypatch
     assert len(texts) == 7, "six times, and the erasure with the error after it"
     assert texts[-1].startswith("paramclient: no reply: ")
     for words, shown in (
-        *((words, "waiting for A of 1/1 px4 (0 s).") for words in (["get", "A"], ["set", "A", 2])),
-        (["fetch"], "fetching 1/1 px4: waiting for the first response (0 s)."),
+        *((words, "waiting for A of 1/1 PX4 quadrotor (0 s).") for words in (["get", "A"], ["set", "A", 2])),
+        (["fetch"], "fetching 1/1 PX4 quadrotor: waiting for the first response (0 s)."),
     ):
         assert drawn(command(words[0], put(Deaf(table={"A": 1})), *words[1:]).err)[0] == shown
 
 
-def test_a_quick_response_leaves_the_terminal_alone(
-    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_quick_response_prints_nothing(command: Command, put: Put, monkeypatch: pytest.MonkeyPatch) -> None:
     use_terminal(monkeypatch)
     assert command("get", put(GenericVehicle({"A": 1})), "A").err == ""

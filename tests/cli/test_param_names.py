@@ -72,7 +72,7 @@ def test_watch_follows_groups_that_appear(command: Command, put: Put) -> None:
     vehicle = ArduPilotVehicle(table=table, groups=groups, live=(), ftp=False)
     url = put(Eventful(vehicle, (8.0, lambda: switch(1)), (24.0, lambda: switch(0))))
     watched = command("watch", url, "grp_*", "--timeout", 60, "--vehicle", 1)
-    assert (watched.code, watched.err) == (0, "watching grp_* of 1/1 ardupilot\n")
+    assert (watched.code, watched.err) == (0, "watching grp_* of 1/1 ArduPilot quadrotor\n")
     found = [line.partition("  ")[2] for line in watched.out.splitlines()]
     assert sorted(line for line in found if not line.startswith("1/1 resynced")) == [
         "GRP_ENABLE  0 -> 1  (vehicle)",

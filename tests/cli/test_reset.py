@@ -81,7 +81,7 @@ def test_defaults_of_metadata_are_used_where_the_vehicle_gives_none(
 def test_metadata_of_the_vehicle_is_downloaded_where_it_gives_no_defaults(command: Command, put: Put) -> None:
     vehicle = PX4Vehicle(table={"MC_ROLL_P": 4.0}, metadata=True)
     vehicle.set_param("MC_ROLL_P", 6.5)
-    said = "1/1 px4: 1 of 1 default from the metadata of the firmware, which does not have the defaults of an"
+    said = "quadrotor: 1 of 1 default from the metadata of the firmware, which does not have the defaults of"
     done = command("reset", put(vehicle), "MC_ROLL_P")
     assert (done.code, vehicle.values["MC_ROLL_P"]) == (0, 4.0), done.err
     assert said in done.err

@@ -101,10 +101,14 @@ def test_cached_parameters_in_no_list_are_counted_apart(command: Command, put: P
     assert "incomplete: 1 of 2 parameters are in the cache, and 2 read by name" in refused.err
 
 
+def test_a_file_from_the_cache_says_what_it_lacks(command: Command, put: Put, tmp_path: Path) -> None:
+    command("fetch", put(Partial({**TABLE, "RC MAP": (1.0, ParamType.REAL32)})))
+    command("save", "1", path := tmp_path / "quad.json")
+    assert "8 of 9 parameters are in the cache" in path.read_text()
+
+
 @pytest.mark.parametrize("ending", ["params", "param", "json"])
-def test_what_a_format_cannot_hold_is_left_out_and_named(
-    command: Command, put: Put, tmp_path: Path, ending: str
-) -> None:
+def test_what_a_format_cannot_hold_is_named(command: Command, put: Put, tmp_path: Path, ending: str) -> None:
     raw = {"WIDE": (b"\1\0\0\0", ParamType.INT64), "ODD": (b"\2\0\0\0", ParamType(0))}
     path, spaced = tmp_path / f"quad.{ending}", tmp_path / "spaced.json"
     saved = command("save", put(Partial({**TABLE, **raw})), path, "--no-cache")
@@ -139,4 +143,4 @@ def test_a_value_that_is_only_cached_is_not_written(command: Command, put: Put, 
     path.unlink()
     saved = command("save", put(PX4Vehicle(table=rows, dead=["CAL_ACC0_XOFF"])), path)
     assert (saved.code, saved.out, path.exists()) == (1, "", False)
-    assert "1/1 px4 on sim:px4 is incomplete: CAL_ACC0_XOFF " in saved.err
+    assert "1/1 is incomplete: CAL_ACC0_XOFF " in saved.err

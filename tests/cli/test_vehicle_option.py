@@ -66,8 +66,8 @@ def test_a_read_says_which_vehicle_it_shows(command: Command, put: Put) -> None:
         several = command(*words)
         assert several.rows[0][0] == "vehicle"
         assert re.search(
-            r"[14]/1 \w+ was used, the first vehicle heard\. Also on this link: [14]/1 \w+ quadrotor\. "
-            rf"{choosing}--vehicle chooses one\n",
+            r"[14]/1 \w+ quadrotor was used, the first vehicle heard\. Also on this link: [14]/1 \w+ "
+            rf"quadrotor\. {choosing}--vehicle chooses one\n",
             several.err,
         )
     assert command("get", url, "A", "--json").json["system"] in (1, 4)
@@ -95,7 +95,7 @@ def test_get_and_fetch_read_every_vehicle(command: Command, put: Put) -> None:
     first, second = read.json["vehicles"]
     assert first["params"]["OF_PX4"]["value"] == 1.5
     assert (read.code, second["params"], [*second["errors"]]) == (2, {}, ["OF_*"])
-    assert "4/1 ardupilot: " in read.err
+    assert "4/1 ArduPilot quadrotor: " in read.err
     fetched = command("fetch", url, "A", "--vehicle", "all")
     assert [line[:3] for line in fetched.words[1:]] == [["1/1", "A", "1.0"], ["4/1", "A", "1.0"]]
     assert len(re.findall(r" bytes received, [0-9,]+ sent on the whole link", fetched.err)) == 2
@@ -117,7 +117,7 @@ def test_all_reads_other_components_that_have_parameters_and_names_those_without
     assert found == ["1/1 A", "1/1 B", "1/154 PAN", "1/155 TILT", "1/101 ZOOM"]
     command("save", url, path := tmp_path / "gimbal.params", "--vehicle", "1/155")
     assert "# 1 parameter of 1/155\n" in path.read_text(), "it is no px4"
-    assert "1/100 camera has no parameters, or none within 2.5 s" in fetched.err
+    assert "1/100 camera has no parameters, or none in 2.5 s" in fetched.err
     assert command("set", url, "ZOOM", 3, "--vehicle", "all").code == 2
     assert not cameras[1].requests["PARAM_SET"]
 
@@ -127,9 +127,9 @@ def test_one_vehicle_that_fails_stops_no_other(command: Command, put: Put) -> No
     read = command("get", url, "A", "--vehicle", "all", "--timeout", "20")
     assert read.code == 3
     assert [line[:2] for line in read.words[1:]] == [["1/1", "A"]]
-    assert "3/1 px4: " in read.err
+    assert "3/1 PX4 quadrotor: " in read.err
     watched = command("watch", url, "A", "--vehicle", "all", "--timeout", "20")
-    assert (watched.code, "paramclient: 3/1 px4: " in watched.err) == (3, True)
+    assert (watched.code, "paramclient: 3/1 PX4 quadrotor: " in watched.err) == (3, True)
 
 
 def test_a_value_without_a_meaning_on_one_vehicle_is_set_on_the_others(command: Command, put: Put) -> None:
@@ -137,7 +137,7 @@ def test_a_value_without_a_meaning_on_one_vehicle_is_set_on_the_others(command: 
     done = command("set", put(Air(vehicles)), "COM_FLTMODE1=Return", "--vehicle", "all", "--json")
     assert (done.code, vehicles[0].values["COM_FLTMODE1"]) == (2, 5)
     assert [each["system"] for each in done.json["vehicles"]] == [1]
-    assert "paramclient: 4/1 ardupilot: COM_FLTMODE1: 'Return' is not a number." in done.err
+    assert "paramclient: 4/1 ArduPilot quadrotor: COM_FLTMODE1: 'Return' is not a number." in done.err
 
 
 def test_set_and_reset_write_to_every_vehicle(command: Command, put: Put, tmp_path: Path) -> None:
@@ -177,11 +177,11 @@ def test_watch_prints_of_which_vehicle_a_change_is(command: Command, put: Put) -
         return watched.out.splitlines()
 
     assert sorted(line.partition("  ")[2] for line in watch("--vehicle", "all")) == [
-        "1/1 px4: A  1.0 -> 3.0  (vehicle)",
-        "2/1 px4: A  1.0 -> 3.0  (vehicle)",
+        "1/1 PX4 quadrotor: A  1.0 -> 3.0  (vehicle)",
+        "2/1 PX4 quadrotor: A  1.0 -> 3.0  (vehicle)",
     ]
     assert {strict(line)["system"] for line in watch("--vehicle", "all", "--json")} == {1, 2}
-    assert re.fullmatch(r"[12]/1 px4: A  1\.0 -> 3\.0  \(vehicle\)", watch()[-1].partition("  ")[2])
+    assert re.fullmatch(r"[12]/1 PX4 quadrotor: A  1\.0 -> 3\.0  \(vehicle\)", watch()[-1].partition("  ")[2])
 
 
 # Vehicles of the cache

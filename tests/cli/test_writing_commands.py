@@ -81,9 +81,7 @@ def untouched(*vehicles: Vehicle) -> bool:
 
 @pytest.mark.parametrize("phase", [0.0, 0.7, 1.15])
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING, "apply to see", "restore to see"])
-def test_with_two_vehicles_nothing_is_written(
-    command: Command, put: Put, words: Words, name: str, phase: float
-) -> None:
+def test_nothing_is_written_to_two(command: Command, put: Put, words: Words, name: str, phase: float) -> None:
     for first, second in ((0.0, phase), (phase, 0.0)):
         one, two = px4(), copter()
         air = Tap(Air([Late(one, first), Late(two, second)]))
@@ -97,9 +95,7 @@ def test_with_two_vehicles_nothing_is_written(
 
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING])
 @pytest.mark.parametrize("system", [1, 2])
-def test_only_the_named_vehicle_is_written_to(
-    command: Command, put: Put, words: Words, name: str, system: int
-) -> None:
+def test_only_the_named_one_is_set(command: Command, put: Put, words: Words, name: str, system: int) -> None:
     one, two = px4(), copter()
     put(Air([one, two] if system == 2 else [two, one]))
     done = command(*words(name), "--vehicle", system, "--timeout", 30)
@@ -162,7 +158,7 @@ def test_a_vehicle_that_appears_during_the_metadata_download_is_not_written_to(
     monkeypatch.setattr("paramclient.cli.set_command.known_of_session", slowly)
     done = command("set", URL, "MC_ROLL_P", "7")
     assert (done.code, done.out) == (2, "")
-    gone = "1/1 px4 is no longer heard; 2/1 ArduPilot quadrotor is heard instead. Nothing was written."
+    gone = "quadrotor is no longer heard; 2/1 ArduPilot quadrotor is heard instead. Nothing was written."
     assert (gone if is_replaced else LISTED) in done.err
     assert untouched(one, two)
 
