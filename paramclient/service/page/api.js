@@ -117,6 +117,7 @@ export class Stream {
     this.reading = reading;
     while (!reading.signal.aborted) {
       try {
+        if ((await roleOf()) === null) throw new Problem(401, null);
         await this.read(reading);
       } catch (error) {
         if (error.status === 401) {

@@ -187,6 +187,7 @@ export async function takeOver() {
     all.indeterminate = count > 0 && count < whole;
     if (hasBegun) return;
     apply.disabled = !count || armed.forbids;
+    apply.classList.toggle("strong", !lines.some((line) => line.box.checked && line.isOutOfRange));
     apply.replaceChildren(el("span", { text: `Apply ${many(count, "value")}` }));
   }
 
@@ -297,6 +298,7 @@ function linesOf(plan, table, other, refresh) {
       ({ name, planned }) =>
         planned &&
         planned.status !== "unchanged" &&
+        planned.before !== planned.wanted &&
         (table.rows.has(name) || planned.category === "missing"),
     )
     .map(({ name, planned }) => {
@@ -328,7 +330,7 @@ function linesOf(plan, table, other, refresh) {
         el("td", { class: "new", text: numberText(planned.wanted, row?.type ?? planned.type) }),
         remark,
       );
-      const line = { name, status, box, remark, element };
+      const line = { name, status, box, remark, element, isOutOfRange };
       line.follow = () => {
         line.before = table.rows.get(name)?.text ?? "";
         setText(now, line.before);

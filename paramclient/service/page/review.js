@@ -131,6 +131,7 @@ export async function review() {
     while (queue.length) sent.outcomes.push(...(await sendBatch(component, queue.splice(0, VALUES_PER_REQUEST), range.isNeeded)));
     for (const each of sent.outcomes) if (each.isTaken) table.pending.delete(each.name);
     isSending = false;
+    armed.element.hidden = range.element.hidden = true;
     store.emit("pending");
     store.emit("table");
     const said = outcomesText(sent.outcomes);
@@ -178,10 +179,13 @@ export function outcomesText(outcomes) {
   return `${sorted.map(([text, count]) => `${count} ${text}`).join(", ")}.`;
 }
 
-/** Returns the display name of a vehicle. */
+/** Returns the display name of a vehicle; with its link, where another one has the same ids. */
 export function nameOf(component) {
   const name = AUTOPILOTS[component.autopilot] ?? (component.kind || component.autopilot);
-  return `${name} ${component.system}/${component.component}${component.extended ? ", extended" : ""}`;
+  const words = `${name} ${component.system}/${component.component}${component.extended ? ", extended" : ""}`;
+  const same = ["system", "component", "extended"];
+  const others = [...store.components.values()].filter((each) => each.link !== component.link);
+  return others.some((each) => same.every((key) => each[key] === component[key])) ? `${words}, ${component.link}` : words;
 }
 
 const AUTOPILOTS = { px4: "PX4", ardupilot: "ArduPilot" };
