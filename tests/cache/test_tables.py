@@ -220,9 +220,7 @@ def later(name: str, bits: int, seconds: float = 1, **more: Any) -> TableUpdate:
     ],
     ids=["nothing", "a change", "volatile", "overtaken", "by others", "received less", "another count"],
 )
-def test_a_hash_stays_with_its_table_while_it_holds(
-    cache: ParamCache, updates: list[TableUpdate], is_kept: bool
-) -> None:
+def test_a_hash_stays_while_it_holds(cache: ParamCache, updates: list[TableUpdate], is_kept: bool) -> None:
     """Two programs may write the changes that each has received, and the hash of what each holds."""
     cache.save(hashed_table(1, 2, 3))
     for each in updates:

@@ -363,9 +363,7 @@ async def test_values_are_accepted_though_they_could_not_be_watched(timeout: flo
         ("an interrupted link", "never"),
     ],
 )
-async def test_another_vehicle_gets_no_set_and_a_rebooted_one_the_others(
-    doubt: str, is_same: bool, said: str
-) -> None:
+async def test_a_rebooted_vehicle_gets_the_others_another_none(doubt: str, is_same: bool, said: str) -> None:
     first, other = PX4Vehicle(uid=1), PX4Vehicle(uid=2)
     async with converse(place := Tap(Air.symmetric([first], delay=0.05))) as conversation:
         if said == "never":

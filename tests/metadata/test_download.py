@@ -208,9 +208,7 @@ def test_a_damaged_file_is_deleted(damage: bytes, tmp_path: Path, caplog: pytest
     assert not list(tmp_path.iterdir())
 
 
-async def test_a_folder_that_cannot_be_written_is_one_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_read_only_folder_is_one_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """For the cache too, whose cause is the same."""
     path = tmp_path / "cache"
     with read_only(tmp_path):
