@@ -116,7 +116,8 @@ async def prove(session: Session) -> None:
                 raise TableDiffers(OTHER) from None  # a range is beyond the end
             if error.code == FileErrorCode.UNKNOWN_COMMAND:
                 session.serves_checksum = False
-            raise FileUnavailable(f"the checksum was refused: {error.reason}") from None
+            is_busy = error.code == FileErrorCode.INVALID_SESSION
+            raise FileUnavailable(BUSY if is_busy else f"the checksum was refused: {error.reason}") from None
         except NoReply as error:
             session.ftp_unanswered += error.attempts
             raise FileUnavailable(UNANSWERED, is_silent=session.serves_checksum is None) from None

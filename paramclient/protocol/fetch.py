@@ -36,7 +36,7 @@ CHANGED: Final = "Changed since they were cached: {}."
 SHOWN_MAX: Final = 5
 """Names that a note has, so that it stays readable."""
 INCOMPLETE: Final = "it has not all parameters, or the vehicle has another number of them by now"
-UNCONFIRMED: Final = "The cached table was not confirmed: {}."
+UNCONFIRMED: Final = "The known table was not confirmed: {}."
 LOST: Final = "The component was lost."
 REPLACED: Final = "Another vehicle has taken the address, and its parameters were fetched: {}."
 PROGRESS_RATE_TIME_MIN: Final = 0.1
