@@ -96,7 +96,7 @@ class Component:
 
     @property
     def is_armed(self) -> bool | None:
-        """Whether the vehicle is armed, from `base_mode` of its last heartbeat; of its autopilot's where the"""
+        """Whether the vehicle is armed, from `base_mode` of its last heartbeat."""
 
     @property
     def silence(self) -> float:

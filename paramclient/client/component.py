@@ -209,10 +209,9 @@ class Component:
 
     @property
     def is_armed(self) -> bool | None:
-        """Whether the vehicle is armed, from `base_mode` of its last heartbeat; of its autopilot's where the
-        component sends none.
+        """Whether the vehicle is armed, from `base_mode` of its last heartbeat.
 
-        None if unknown: before the first heartbeat, while the component is lost, and in high-latency mode, in
+        It is the autopilot's where the component sends none. None if unknown: before the first heartbeat, while the component is lost, and in high-latency mode, in
         which a vehicle sends no heartbeats.
         """
         presence = (self.node if self.node.presence.has_beaten else self.vehicle).presence
