@@ -211,8 +211,8 @@ class Component:
     def is_armed(self) -> bool | None:
         """Whether the vehicle is armed, from `base_mode` of its last heartbeat.
 
-        It is the autopilot's where the component sends none. None if unknown: before the first heartbeat, while the component is lost, and in high-latency mode, in
-        which a vehicle sends no heartbeats.
+        It is that of its autopilot where the component sends none. None if unknown: before the first one,
+        while the component is lost, and in high-latency mode, in which a vehicle sends no heartbeats.
         """
         presence = (self.node if self.node.presence.has_beaten else self.vehicle).presence
         if presence.base_mode is None or presence.is_lost:
