@@ -48,7 +48,7 @@ LIST_RATE_SLOW: Final = 200.0
 USB (measured); a 57600 baud radio carries 40."""
 SLOW_LIST: Final = ": a slow port or radio. Raise its rate (PX4: MAV_n_RATE, ArduPilot: SERIALn_BAUD)."
 """Causes of a slow list, and what to do."""
-ENABLE_FTP: Final = "Check that BRD_OPTIONS leaves MAVFTP on (bit 1), and that the firmware is 4.1 or newer."
+ENABLE_FTP: Final = "Is MAVFTP on (BRD_OPTIONS, bit 1), and used by no other? Is the firmware 4.1 or newer?"
 """What to do about an ArduPilot that serves no parameter file."""
 LESS_LOSS: Final = "Check antenna, distance and baud rate, or send less telemetry on this link."
 """What to do about lost frames."""
