@@ -408,6 +408,7 @@ class Component:
             self.core.station.check_may_send()
             if self.policy is not Policy.AUTO:
                 raise UsageError(f"refresh needs a download, and the policy is {self.policy}")
+            self.session.serves_file = self.session.serves_file or None  # it may by now
         began, generation = anyio.current_time(), self.node.generation
         if timeout is None and self._waits_for_others:
             timeout = PASSIVE_TIMEOUT

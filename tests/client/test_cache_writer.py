@@ -36,10 +36,10 @@ ODD = ("CAL_ACC0_XOFF", "PARAM_03", "PARAM_07")
 """Volatile parameters that cannot be determined from the hash alone: two are of no group that usually is."""
 
 
-async def session(endpoint: Endpoint, path: Path | ParamCache) -> FetchResult:
+async def session(endpoint: Endpoint, path: Path | ParamCache, *, refresh: bool = False) -> FetchResult:
     """One session with the first autopilot: a fetch."""
     async with connected(endpoint, cache=path) as (_, component):
-        return await component.fetch_all()
+        return await component.fetch_all(refresh=refresh)
 
 
 def kept(path: Path, system: int = 1) -> dict[str, int]:
@@ -433,16 +433,15 @@ async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Pa
     assert said(path) == (0, None)
 
 
-@pytest.mark.parametrize(("kind", "why"), [("no file", "no file of its"), ("silent", "did not answer")])
-async def test_that_there_is_no_file_is_remembered_but_no_silence(path: Path, kind: str, why: str) -> None:
+@pytest.mark.parametrize("kind", ["no file", "silent", "refreshed"])
+async def test_that_there_is_no_file_is_remembered_but_no_silence(path: Path, kind: str) -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     server = vehicle.file_server
     assert server is not None
     rows = server.params
-    if kind == "no file":
-        server.params = lambda: None
-    else:
+    if kind == "silent":
         vehicle.file_server = None
+    server.params = lambda: None
     requested = shell.Tap(vehicle)
     first = await session(requested, path)
     assert (first.source, first.complete) == ("stream", True)
@@ -452,10 +451,12 @@ async def test_that_there_is_no_file_is_remembered_but_no_silence(path: Path, ki
     requested.received.clear()
     second = await session(requested, path)
     assert second.source == "stream"
+    why = "did not answer" if kind == "silent" else "no file of its parameters"
     assert [why in note for note in second.notes] == [True]
     assert bool(requested.messages(messages.FileTransfer)) == (kind == "silent")
     vehicle.file_server, server.params = server, rows
-    assert (await session(requested, path)).source == {"no file": "stream", "silent": "cache"}[kind]
+    third = await session(requested, path, refresh=kind == "refreshed")
+    assert third.source == {"no file": "stream", "silent": "cache", "refreshed": "ftp"}[kind]
     vehicle.version = replace(vehicle.version, flight_sw_version=67502081)
     assert (await session(requested, path)).source == "ftp"
     assert said(path)[1] is True
