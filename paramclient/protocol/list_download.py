@@ -168,7 +168,7 @@ class _Download:
             self._began = anyio.current_time()  # of the list, if there is one
         self._listed_at = self._began
         self._take(first)
-        self._reading.clear()
+        self._tried, self._reading = dict.fromkeys(self._reading, 0), set()
 
     def _first(self, message: Message) -> Message | None:
         """Return the first value of the list; PX4's hash comes before it, and says nothing of its end."""
@@ -183,7 +183,7 @@ class _Download:
         if not self.reads_beside:
             await self._take_passes()
         await self._read_gaps()
-        serves_reads, count = self.session.serves_reads.get(int), self._count
+        serves_reads, count = self.session.serves_reads.get(int) or not self._is_served, self._count
         has_loss = not serves_reads and any(0 < index < self._reached for index in self._lost)
         # passes without a new value after which the count may be false: some may be lost
         left = 0 if serves_reads or count == 1 else FRUITLESS_PASSES_MAX if has_loss else 1
@@ -314,7 +314,8 @@ class _Download:
             return sorted(index for index in self._skipped if index <= self._reached - TAIL)
         gaps, count = set(self._missing()), self._count or 0
         if self.table.is_growing or not self._is_served:
-            gaps |= {0, *range(count, count + (1 if self._is_served else READS_AHEAD))}
+            is_open = self.table.is_growing and not self._is_served
+            gaps |= {0, *range(count, count + (READS_AHEAD if is_open else 1 + (0 not in self._received)))}
         elif 0 in gaps and self._is_given_up(0):
             gaps.add(count)
         return sorted(index for index in gaps - self._received if index < PARAMETERS_MAX)

@@ -103,6 +103,7 @@ async def test_a_value_in_another_type_after_a_set_is_taken() -> None:
         assert (await fetch_all(session)).params["MODE"].value == 2.5
 
 
+INDICES = ("indices", "commands")
 FORTY = {f"P{number:02}": (number, ParamType.INT32) for number in range(40)}
 COUNTS: dict[str, Callable[[int], int]] = {
     "right": lambda index: 40,
@@ -120,14 +121,14 @@ COUNTS: dict[str, Callable[[int], int]] = {
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize(
     ("serves", "loss"),
-    [(EVERYTHING, 0.0), (EVERYTHING, 0.1), (("list",), 0.0), (("indices",), 0.0)],
-    ids=["all", "all, loss", "list only", "reads by index only"],
+    [(EVERYTHING, 0.0), (EVERYTHING, 0.1), (("list",), 0.0), (("indices",), 0.0), (INDICES, 0.1)],
+    ids=["all", "all, loss", "list only", "reads by index only", "reads by index only, loss"],
 )
 async def test_odd_indices_and_counts_make_a_complete_table(
     serves: tuple[str, ...], loss: float, count: str, first: int, heartbeat: messages.Heartbeat
 ) -> None:
     vehicle = Partial(FORTY, serves=serves, count=COUNTS[count], first=first, heartbeat=heartbeat)
-    async with talking(Air.symmetric([vehicle], loss=loss, seed=5)) as (conversation, session):
+    async with talking(Air.symmetric([vehicle], delay=0.05, loss=loss, seed=3)) as (conversation, session):
         result = await fetch_all(session)
         assert (result.complete, len(result.params), result.count, result.missing) == (True, 40, 40, ())
         assert {name: (each.value, each.index) for name, each in result.params.items()} == {
@@ -140,7 +141,7 @@ async def test_odd_indices_and_counts_make_a_complete_table(
         assert session.table.is_complete
 
 
-@pytest.mark.parametrize("serves", [EVERYTHING, ("list",), ("indices", "commands")])
+@pytest.mark.parametrize("serves", [EVERYTHING, ("list",), INDICES])
 @pytest.mark.parametrize("loss", [0.1, 0.2])
 async def test_a_growing_count_is_complete_at_its_end_only(loss: float, serves: tuple[str, ...]) -> None:
     for seed in range(12):
