@@ -18,7 +18,7 @@ from paramclient.protocol.digest import Answer, ask, settle
 from paramclient.protocol.file_download import download_file
 from paramclient.protocol.ftp import SILENT_LOST
 from paramclient.protocol.list_download import ListResult, download_list
-from paramclient.protocol.reads import is_stale, read_many
+from paramclient.protocol.reads import read_many
 from paramclient.protocol.session import UNANSWERED, FileUnavailable, Session
 
 FetchSource: TypeAlias = Literal["cache", "ftp", "stream"]
@@ -274,10 +274,11 @@ class _Fetch:
 
     async def _read_unverified(self) -> None:
         """Read the values that the digest does not cover."""
-        outside = (name for name in self.table.volatile if is_stale(self.session, name, 0.0))
-        names = dict.fromkeys([*self.table.unverified(), *outside])
-        await read_many(self.session, names)
-        if left := [name for name in names if self.table.moments.get(name, math.inf) < self._began]:
+        is_px4, table = self.session.identification.is_px4, self.table
+        outside = table.volatile & table.params.keys() if is_px4 else set[str]()
+        await read_many(self.session, names := sorted({*table.unverified(), *outside}))
+        if left := [name for name in names if table.moments.get(name, math.inf) < self._began]:
+            table.doubt(*left)
             self.notes.append(NOT_READ.format(first_of(left, SHOWN_MAX)))
 
     def _unconfirmed(self) -> FetchResult:

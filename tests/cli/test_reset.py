@@ -64,9 +64,7 @@ def test_without_any_known_default_nothing_is_written(command: Command, put: Put
     assert "defaults are not known" in done.err
 
 
-def test_defaults_of_metadata_are_used_where_the_vehicle_gives_none(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
+def test_metadata_gives_defaults_where_no_vehicle_does(command: Command, put: Put, tmp_path: Path) -> None:
     described = metadata_file(tmp_path, A={"default": 2.5}, C={"type": "Int32", "default": 7})
     vehicle = GenericVehicle(table={"A": 5.0, "B": 6.0, "C": 7})
     words = ["reset", put(vehicle), "--all", "--metadata", described]
