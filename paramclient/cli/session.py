@@ -329,7 +329,7 @@ async def sessions(
                 try:
                     found = await client.find_autopilots(timeout=deadline.heartbeat_timeout)
                 except NoReply:
-                    if not client.components or (writes and not options.extended):
+                    if client.listens_only or not client.components or (writes and not options.extended):
                         raise
                     found = []
             known = [each for each in client.components.values() if each.node.identification.has_parameters]

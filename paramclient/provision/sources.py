@@ -293,9 +293,9 @@ def _cached_set(table: CachedComponent, *, extended: bool, partial: bool) -> Par
         VehicleError: the cache has not all of them, and `partial` is false.
     """
     lacks = ""
-    if not table.complete or table.size < (table.count or 0):
+    others = 0 if table.count is None else sum(param.index is None for param in table.params.values())
+    if not table.complete or table.size - others < (table.count or 0):
         of = "" if table.count is None else f" of {table.count}"
-        others = sum(param.index is None for param in table.params.values()) if of else 0
         lacks = f"{table.size - others}{of} parameters are in the cache"
         lacks += f", and {others} read by name" if others else ""
         if not (table.complete or partial):
