@@ -312,12 +312,13 @@ class VehicleLink(Tap):
     def table_of_answer(self, seen: SeenFrame, peer: Hashable) -> KeptTable | None:
         """Return the table to which a withheld value or answer belongs; None for a frame that passes."""
         frame = seen.frame
-        node = self._station.nodes.get((frame.system, frame.component))
+        own, node = self._station.own_address, self._station.nodes.get((frame.system, frame.component))
         if node is None or node.peer != peer:
             return None
         tables = [self._table(node, extended=each) for each in (False, True)]  # from its first frame on
         is_extended = frame.message_id in EXTENDED_ANSWERS
-        is_for_us = frame.payload[1:3] == bytes(self._station.own_address)
+        # some PX4s answer to no component, or to the one that was asked
+        is_for_us = frame.payload[1:3] == bytes(own) or _target_of(frame) == own[0] != frame.system
         is_plain = frame.message_id in PLAIN_ANSWERS or (frame.message_id == FILE_TRANSFER and is_for_us)
         table = tables[is_extended]
         return table if (is_extended or is_plain) and table.withholds else None
