@@ -298,7 +298,7 @@ function linesOf(plan, table, other, refresh) {
       ({ name, planned }) =>
         planned &&
         planned.status !== "unchanged" &&
-        planned.before !== planned.wanted &&
+        (planned.status === "set" || planned.before !== planned.wanted) &&
         (table.rows.has(name) || planned.category === "missing"),
     )
     .map(({ name, planned }) => {
