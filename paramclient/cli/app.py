@@ -20,8 +20,6 @@ from paramclient.cli.output import STDIN, ExitCode, code_of, report, say, text_o
 from paramclient.errors import ParamClientError
 from paramclient.version import __version__
 
-_HELPED: Final = frozenset({"--help", "-h", "cache", "metadata", "signing"})
-"""Words with which help is printed that describes each subcommand; groups print it where none follows."""
 _LINE_BREAK: Final = re.compile(r"(?<=\S)\n( {8})?(?=\S)")
 """A line break within a paragraph of a docstring, of which help would make one on every terminal."""
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
@@ -34,7 +32,8 @@ def run(arguments: Sequence[str]) -> int:
         KeyboardInterrupt: Ctrl-C while nothing is awaited, or a second Ctrl-C.
         BrokenPipeError: the reader of stdout has closed it.
     """
-    if not arguments or not _HELPED.isdisjoint(arguments):
+    # groups print help where no subcommand follows
+    if not arguments or not {"--help", "-h", "cache", "metadata", "signing"}.isdisjoint(arguments):
         for _, app in subcommands():  # imports all of them, so that the help can describe each
             app.default_command.__doc__ = _LINE_BREAK.sub(" ", inspect.getdoc(app.default_command) or "")
     with _messages_shown(verbose=not {"--verbose", "-v"}.isdisjoint(arguments)):

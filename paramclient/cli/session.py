@@ -164,8 +164,7 @@ class CommandSession:
     def receiver(self) -> str:
         """Address, kind and firmware of the component: `1/1 PX4 quadrotor, firmware 1.16.0`."""
         firmware = self.component.node.identification.identity.firmware
-        version = f", firmware {version_text(firmware)}" if firmware else ""
-        return f"{self.label}{version}"
+        return f"{self.label}, firmware {version_text(firmware)}" if firmware else self.label
 
     async def fetch(self, *, refresh: bool = False) -> FetchResult:
         """Fetch the table; after an interruption, print what was received and kept."""
@@ -329,7 +328,9 @@ async def sessions(
                 try:
                     found = await client.find_autopilots(timeout=deadline.heartbeat_timeout)
                 except NoReply:
-                    if client.listens_only or not client.components or (writes and not options.extended):
+                    heard = (each.node.identification for each in client.components.values())
+                    is_needed = client.listens_only or (writes and not options.extended)
+                    if is_needed or not any(each.has_parameters for each in heard):
                         raise
                     found = []
             known = [each for each in client.components.values() if each.node.identification.has_parameters]

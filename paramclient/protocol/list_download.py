@@ -183,7 +183,7 @@ class _Download:
         if not self.reads_beside:
             await self._take_passes()
         await self._read_gaps()
-        serves_reads, count = self.session.serves_reads.get(int) or not self._is_served, self._count
+        serves_reads, count = self.session.serves_reads.get(int, not self._is_served), self._count
         has_loss = not serves_reads and any(0 < index < self._reached for index in self._lost)
         # passes without a new value after which the count may be false: some may be lost
         left = 0 if serves_reads or count == 1 else FRUITLESS_PASSES_MAX if has_loss else 1
