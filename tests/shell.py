@@ -64,9 +64,7 @@ class SimulatedTimeLoop(asyncio.SelectorEventLoop):
     def time(self) -> float:
         return self.now
 
-    def run_between_rounds(
-        self, task: asyncio.Task[Any], action: Callable[[], object], *, after: int
-    ) -> None:
+    def run_between_rounds(self, task: asyncio.Task[Any], action: Callable[[], Any], *, after: int) -> None:
         """Do this between two rounds of the loop, so many from now, if the task is not done by then."""
         self.has_run_action = False
         self._rounds_left = after

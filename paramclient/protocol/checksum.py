@@ -22,7 +22,7 @@ import anyio
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, VehicleError
 from paramclient.model.px4_hash import crc32_px4, crc32_px4_before
-from paramclient.model.values import Encoding, ParamType, Trust, as_reported, bits_of, bits_of_wire, from_bits
+from paramclient.model.values import ParamType, Trust, as_reported, bits_of, bits_of_wire, from_bits
 from paramclient.protocol.channel import task_group
 from paramclient.protocol.ftp import BUSY, checksum, is_free
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode_entries, header
@@ -44,8 +44,6 @@ FILE_ROUND_TRIPS: Final = 3
 """Round trips of a download: to open the file, to its first block, and to close it."""
 FILE_RATE: Final = 48_500
 """Bytes per second of a download where the link does not limit it (measured)."""
-FLOAT32_EXACT: Final = 2**24
-"""The largest integer up to which float32 holds all."""
 BOOT_COUNT: Final = "STAT_BOOTCNT"
 SECONDS: Final = re.compile("STAT_RUNTIME|STAT_FLTTIME")
 """Names of values that count seconds."""
@@ -146,9 +144,9 @@ class _Proof:
         measures = session.identification.vehicle_type in PLANES_AND_ROVERS
         self._always = self._named(PRESSURE) if measures else set[int]()  # rows that always move
         seconds = self._named(SECONDS)
-        often = {at for at, row in enumerate(rows) if row.name in table.volatile}
-        rare = {at for at, row in enumerate(rows) if row.name == BOOT_COUNT or may_be_rounded(row)}
-        self._moving = self._always | seconds | often | rare  # rows that may have moved
+        names = {BOOT_COUNT, *table.volatile, *table.rounded}
+        self._moving = self._always | seconds  # rows that may have moved
+        self._moving |= {at for at, row in enumerate(rows) if row.name in names}
         is_first = any(param.trust is Trust.CACHED for param in table.params.values())
         is_slow = is_first and (session.channel.timing.round_trip or 0.0) > SLOW_ROUND_TRIP
         passed = {at for at in seconds if is_first and now - table.moments.get(rows[at].name, now) >= 1}
@@ -398,18 +396,8 @@ def _bits_to_write(bits: int, kind: ParamType) -> float:
 def _rows(table: Table) -> list[PackedParam]:
     names = [table.names.get(index, "") for index in range(table.count or 0)]
     if not table.params.keys() >= set(names) or len(set(names)) < len(names):
-        raise FileUnavailable(
-            "the list of parameters has a gap, a name twice, or one that no file can contain"
-        )
+        raise FileUnavailable("the list has a gap, a name twice, or one that no file can contain")
     params = [table.params[name] for name in names]
     if inexact := [each.name for each in params if each.is_raw or each.type not in PACKABLE]:
         raise FileUnavailable(f"the exact value of {inexact[0]} is not known")
     return [PackedParam(each.name, ParamType(each.type), each.bits) for each in params]
-
-
-def may_be_rounded(row: PackedParam) -> bool:
-    """Return whether the integer may stand for others, as a C-cast PARAM_VALUE rounds them to float32."""
-    if row.type is not ParamType.INT32 or abs(int(from_bits(row.bits, row.type))) <= FLOAT32_EXACT:
-        return False
-    bits, _ = bits_of_wire(as_reported(row.bits, row.type, Encoding.C_CAST), row.type, Encoding.C_CAST)
-    return bits == row.bits

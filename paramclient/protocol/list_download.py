@@ -389,7 +389,5 @@ class _Download:
         self._received.add(index)
         self._skipped.discard(index)
         if index > self._reached:
-            self._skipped.update(
-                each for each in range(self._reached + 1, index) if each not in self._received
-            )
+            self._skipped |= set(range(self._reached + 1, index)) - self._received
             self._reached = index

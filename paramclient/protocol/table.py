@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final, Literal, TypeAlias
 
 from paramclient.model.px4_hash import find_volatile, hash_bits
 from paramclient.model.values import (
@@ -30,8 +30,12 @@ use). No real component has more."""
 BEYOND_MAX: Final = 64
 """Indices by which a value may be beyond the count, so that the count is false: more than are lost in a row.
 Values further beyond are stored without their index."""
+FLOAT32_EXACT: Final = 2**24
+"""The largest integer up to which float32 holds all."""
 LEFT_OUT_MAX: Final = 10
 """Names that are not stored, of which the notes tell; so that they stay readable."""
+
+Kind: TypeAlias = Literal["changed", "first", "added", "removed"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +56,7 @@ class Change:
     old: Param | None
     new: Param | None
     by: str
-    kind: Literal["changed", "first", "added", "removed"]
+    kind: Kind
 
 
 class Table:
@@ -66,7 +70,6 @@ class Table:
         count: the latest param_count, or None.
         names: the name at each known index. Indices are valid for one count only.
         moments: when each value arrived, by name, in seconds of the event loop's clock.
-        is_exact: whether every integer is exact: read from a file, or small enough for float32.
         volatile: names outside the vehicle's hash, as far as known.
         author_of: returns the author of a change of a name.
         left_out: received names that not every parameter file can hold, and that are not stored.
@@ -95,6 +98,7 @@ class Table:
         self._held: dict[str, Change] | None = {} if dialect is PLAIN else None
         self._encoding = Encoding.BYTEWISE
         self._wire: dict[str, tuple[bytes, int]] = {}  # as received, until the encoding is certain
+        self._exact: set[str] = set()  # names whose value a file or a checksum has shown
         self.evidence: dict[Encoding, tuple[str, bytes, int]] = {}
         self.was_complete = False
         self._false_count: int | None = None  # a param_count that values exceeded
@@ -146,6 +150,12 @@ class Table:
             self._hash = hash_bits(self.listed_bits(), leave_out=self.volatile)
         return self._hash
 
+    @property
+    def rounded(self) -> set[str]:
+        """Names of integers that may stand for others: a C-cast PARAM_VALUE rounds them to float32."""
+        names = self.params.keys() - self._exact if self._encoding is Encoding.C_CAST else ()
+        return {name for name in names if _is_rounding(self.params[name])}
+
     def listed_bits(self) -> dict[str, int]:
         """Return the bits of the parameters that have an index, by name."""
         return {name: param.bits for name, param in self.params.items() if param.index is not None}
@@ -176,19 +186,19 @@ class Table:
             self._take_place(name, place)
         self.moments[name] = now
         self._take_evidence(name, raw, number)
-        if old is None:
-            if len(self.params) >= NAMES_MAX:
-                return
-            new = self.dialect.param(name, raw, number, place, self._encoding)
-        elif not is_exact and self.is_reported(old, raw, number):
+        if old is None and len(self.params) >= NAMES_MAX:
+            return
+        if old is not None and not is_exact and self.is_reported(old, raw, number):
             new = replace(old, index=place, trust=Trust.LIVE)
         else:
             new = self.dialect.param(name, raw, number, place, self._encoding)
-            if new.type == old.type:
+            if old is not None and new.type == old.type:
                 new = replace(new, default=old.default)
         if self._held is not None:
             self._wire[name] = (raw, number)
         self._put(name, old, new)
+        if is_exact:
+            self._exact.add(name)
 
     def _take_count(self, name: str, count: int, index: int) -> int | None:
         """Take the count of a value, unless it is false. Return the index; None for a value without one."""
@@ -250,27 +260,26 @@ class Table:
             now: when the file was requested: the vehicle may have read the value at any time since.
             with_defaults: whether an entry without a default has its default value.
         """
-        name = entry.name
+        name, kind, bits, own_default = entry
         if not self._may_store(name):
             self.names[index] = name
             return
         old = self.params.get(name)
         self._take_place(name, index)
-        default_bits = entry.default if entry.default is not None else entry.bits if with_defaults else None
-        default = None if default_bits is None else from_bits(default_bits, entry.type)
-        new = Param(
-            name, from_bits(entry.bits, entry.type), entry.type, index, entry.bits, Trust.LIVE, default
-        )
-        raw = as_reported(entry.bits, entry.type, self._encoding)
+        default_bits = own_default if own_default is not None else bits if with_defaults else None
+        default = None if default_bits is None else from_bits(default_bits, kind)
+        new = Param(name, from_bits(bits, kind), kind, index, bits, Trust.LIVE, default)
+        raw = as_reported(bits, kind, self._encoding)
         moment = max(now, self.moments.get(name, now))
         is_newer = old is not None and moment > now and old.trust is Trust.LIVE
-        if old is not None and is_newer and not self.is_reported(old, raw, entry.type):
+        if old is not None and is_newer and not self.is_reported(old, raw, kind):
             self.params[name] = replace(old, index=index, default=default)
             return
         self.moments[name] = moment
         if self._held is not None:
-            self._wire[name] = (raw, entry.type)
+            self._wire[name] = (raw, kind)
         self._put(name, old, new)
+        self._exact.add(name)
 
     def _take_place(self, name: str, index: int) -> None:
         before = self.names.get(index, name)
@@ -291,11 +300,10 @@ class Table:
         if not self.is_complete:
             return
         self.was_complete = True
-        names, outdated = self.names, self._outdated
         gone = [
             name
             for name, param in self.params.items()
-            if name in outdated or (param.index is not None and names.get(param.index) != name)
+            if name in self._outdated or (param.index is not None and self.names.get(param.index) != name)
         ]
         self._outdated.clear()
         for name in gone:
@@ -333,12 +341,10 @@ class Table:
         self.params[name] = new
         if old is not None and old.same_value(new):
             return
+        self._exact.discard(name)
         self._invalidate_hash(name)
-        by = self.author_of(name)
-        if old is not None:
-            self._report(Change(name, old, new, by, "changed"))
-        else:
-            self._report(Change(name, None, new, by, "added" if self.was_complete else "first"))
+        kind: Kind = "changed" if old is not None else "added" if self.was_complete else "first"
+        self._report(Change(name, old, new, self.author_of(name), kind))
 
     def _report(self, change: Change) -> None:
         if self._held is None:
@@ -375,6 +381,7 @@ class Table:
     def prove(self, checksum: int) -> None:
         """Take a checksum that covers the whole table, and mark the cached values as verified."""
         self._hash, self._hash_is_stale = checksum, False
+        self._exact.update(self.params)
         self._verify(but=frozenset())
 
     def _verify(self, *, but: frozenset[str]) -> None:
@@ -393,9 +400,10 @@ class Table:
 
     def clear(self) -> None:
         """Forget everything: another vehicle uses the address."""
-        for each in (self.params, self.names, self.moments, self._wire, self._outdated, self.left_out):
+        for each in (self.params, self.names, self.moments, self._wire, self.evidence):
             each.clear()
-        self.evidence.clear()
+        for names in (self._outdated, self._exact, self.left_out):
+            names.clear()
         self.count = self._false_count = None
         self.is_growing, self.begins_at_1 = True, False
         self.volatile, self.volatile_is_known = frozenset(), False
@@ -437,6 +445,8 @@ class Table:
             if old is None:
                 self.params[param.name] = param.with_trust(Trust.CACHED)
                 self.moments[param.name] = moments[param.name]
+                if hash is not None:
+                    self._exact.add(param.name)
             elif old.type == param.type:
                 index = old.index if old.index is not None or not has_indices else param.index
                 default = old.default if old.default is not None else param.default
@@ -480,3 +490,9 @@ class Table:
             self.unconfirm()
         elif name not in self.volatile:
             self._hash_is_stale = self._hash is not None
+
+
+def _is_rounding(param: Param) -> bool:
+    """Return whether the value is an integer to which a float32 rounds others: a multiple of 24 digits."""
+    whole = abs(int(param.value)) if param.type is ParamType.INT32 and not param.is_raw else 0
+    return whole >= FLOAT32_EXACT > whole // (whole & -whole)

@@ -12,7 +12,7 @@ import anyio
 from paramclient.errors import FileErrorCode
 from paramclient.model.px4_hash import crc32_px4
 from paramclient.model.values import ParamType, Trust, bits_of
-from paramclient.protocol.checksum import CHECKED_READ_SIZE, may_be_rounded
+from paramclient.protocol.checksum import CHECKED_READ_SIZE
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode
 from paramclient.protocol.session import Session
@@ -73,6 +73,8 @@ class Rows(NamedTuple):
 def rows_of(session: Session) -> Rows | None:
     """Return the entries of the file of a complete table; None if the table does not have them exactly."""
     table, entries = session.table, []
+    if table.rounded:
+        return None
     params = [table.params[name] for _, name in sorted(table.names.items())]
     for param in params:
         if param.is_raw or param.type not in PACKABLE or param.trust is Trust.CACHED:
@@ -80,8 +82,6 @@ def rows_of(session: Session) -> Rows | None:
         name, kind, bits, default = param.name, ParamType(param.type), param.bits, param.default
         own = None if default is None or not param.is_changed else bits_of(default, kind)
         entries.append(PackedParam(name, kind, bits, own))
-    if table.hash is None and any(may_be_rounded(row) for row in entries):
-        return None
     return Rows(entries, all(each.default is not None for each in params))
 
 

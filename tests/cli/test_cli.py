@@ -190,9 +190,7 @@ def test_numbers_are_parsed_exactly(command: Command, put: Put, name: str, text:
     assert vehicle.values[name] == held
 
 
-def test_fetch_names_changes_since_an_ardupilot_was_cached(
-    command: Command, put: Put, tmp_path: Path
-) -> None:
+def test_fetch_names_changes_since_a_table_was_cached(command: Command, put: Put, tmp_path: Path) -> None:
     vehicle = ArduPilotVehicle()
     fetch = ("fetch", put(vehicle), "RTL_ALT", "--cache", tmp_path / "cache.sqlite3")
     assert command(*fetch).code == 0

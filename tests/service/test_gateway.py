@@ -23,7 +23,7 @@ import anyio
 import fastcrc
 import pytest
 
-from paramclient import Param, ParamType
+from paramclient import ParamType
 from paramclient.client import taps
 from paramclient.client.signing import Signing
 from paramclient.errors import UsageError
@@ -386,11 +386,15 @@ def test_rule_2_a_file_with_defaults_that_are_unknown_is_one_without() -> None:
     assert unknown.content(full, 80)[:2] == b"\x1b\x67"
 
 
-def test_rule_2_a_file_has_no_integers_that_a_list_may_have_rounded() -> None:
-    table = Mock(names={0: "A"}, params={"A": Param("A", 1 << 25, ParamType.INT32, 0, 1 << 25)}, hash=None)
-    assert kept_file.rows_of(Mock(table=table)) is None
-    table.hash = 1  # proven
-    assert kept_file.rows_of(Mock(table=table)) is not None
+async def test_rule_2_a_file_passes_while_an_announced_integer_may_be_rounded() -> None:
+    (model := ArduPilotVehicle()).load({"BARO_PROBE_EXT": 1 << 25})
+    async with in_sync(model) as (_, vehicle, station):
+        for name, value, passes in (("STAT_RUNTIME", 1 << 23, False), ("BARO_PROBE_EXT", 1 << 24, True)):
+            model.set_param(name, value)  # announced as float32
+            await anyio.sleep(0.1)
+            assert await station.ask_file(Opcode.OPEN_FILE_RO, data=b"@PARAM/param.pck", session=passes)
+            opened = [Packet.unpack(each.payload).opcode for each in vehicle.messages(FileTransfer)]
+            assert (Opcode.OPEN_FILE_RO in opened) == passes
 
 
 @pytest.mark.parametrize("query", [b"", b"?withdefaults=1"])
