@@ -286,9 +286,8 @@ class _Proof:
         requests += parts * (sum(depths) - len(depths))
         slots = 0.5 + reads // READS_PER_SLOT_ARDUPILOT
         search = (rounds + 1) * trip + requests * INTERVAL + slots * SLOT_ARDUPILOT
-        byte_time = max(1 / FILE_RATE, self._byte_time)
         size = sum(map(len, self._entries(range(len(self._rows)))))
-        if search > FILE_ROUND_TRIPS * trip + byte_time * size:
+        if search > FILE_ROUND_TRIPS * trip + max(1 / FILE_RATE, self._byte_time) * size:
             raise TableDiffers(TOO_MANY)
 
     async def _request(self, places: Collection[range]) -> None:
@@ -309,7 +308,8 @@ class _Proof:
                 tasks.start_soon(request, place)
             sent_at = anyio.current_time()
             await anyio.sleep(0.001)  # the requests are sent first: the rows take milliseconds
-            self._entries(ranges[0])  # while the vehicle computes
+            for place in (*ranges, whole):  # while the vehicle computes
+                self._entries(place)
         elapsed = anyio.current_time() - sent_at
         self._round_trip = min(self._round_trip, elapsed)
         self._byte_time = (elapsed - self._round_trip) / (REQUEST_SIZE * len(ranges))
@@ -400,4 +400,4 @@ def _rows(table: Table) -> list[PackedParam]:
     params = [table.params[name] for name in names]
     if inexact := [each.name for each in params if each.is_raw or each.type not in PACKABLE]:
         raise FileUnavailable(f"the exact value of {inexact[0]} is not known")
-    return [PackedParam(each.name, ParamType(each.type), each.bits) for each in params]
+    return [PackedParam(each.name, each.type, each.bits) for each in params]

@@ -11,7 +11,7 @@ import anyio
 
 from paramclient.errors import FileErrorCode
 from paramclient.model.px4_hash import crc32_px4
-from paramclient.model.values import ParamType, Trust, bits_of
+from paramclient.model.values import Trust, bits_of
 from paramclient.protocol.checksum import CHECKED_READ_SIZE
 from paramclient.protocol.ftp import DATA_SIZE_MAX, Opcode, Packet
 from paramclient.protocol.param_pck import PACKABLE, PARAM_FILE, PackedParam, encode
@@ -79,9 +79,8 @@ def rows_of(session: Session) -> Rows | None:
     for param in params:
         if param.is_raw or param.type not in PACKABLE or param.trust is Trust.CACHED:
             return None
-        name, kind, bits, default = param.name, ParamType(param.type), param.bits, param.default
-        own = None if default is None or not param.is_changed else bits_of(default, kind)
-        entries.append(PackedParam(name, kind, bits, own))
+        own = None if param.default is None or not param.is_changed else bits_of(param.default, param.type)
+        entries.append(PackedParam(param.name, param.type, param.bits, own))
     return Rows(entries, all(each.default is not None for each in params))
 
 
