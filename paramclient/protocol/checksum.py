@@ -307,7 +307,7 @@ class _Proof:
                     await anyio.sleep(INTERVAL if number > AT_ONCE else INTERVAL_FIRST)
                 tasks.start_soon(request, place)
             sent_at = anyio.current_time()
-            await anyio.sleep(0.001)  # the requests are sent first: the rows take milliseconds
+            await anyio.sleep(0.003)  # the requests are sent first: the rows take milliseconds
             for place in (*ranges, whole):  # while the vehicle computes
                 self._entries(place)
         elapsed = anyio.current_time() - sent_at
