@@ -151,7 +151,6 @@ class _Proof:
         is_slow = is_first and (session.channel.timing.round_trip or 0.0) > SLOW_ROUND_TRIP
         passed = {at for at in seconds if is_first and now - table.moments.get(rows[at].name, now) >= 1}
         self._alone = passed | ({0} if is_slow else set())  # compared first; 0 shows the count
-        self._fresh = set[int]() if is_slow else self._alone
 
     async def run(self) -> bool:
         """Compare, and read what differs, until nothing does. Return whether one checksum proves all rows.
@@ -183,7 +182,7 @@ class _Proof:
                 elif guess := self._guess(place, difference):
                     guesses |= guess
                 elif len(place) > 1:
-                    moving = self._moving - (self._fresh if place in between else set())
+                    moving = self._moving - (self._alone if place in between else set())
                     ends = {end for at in moving for end in (at, at + 1)}.intersection(place[1:])
                     if not ends:
                         divided.append(place)

@@ -32,8 +32,8 @@ BEYOND_MAX: Final = 64
 Values further beyond are stored without their index."""
 FLOAT32_EXACT: Final = 2**24
 """The largest integer up to which float32 holds all."""
-LEFT_OUT_MAX: Final = 10
-"""Names that are not stored, of which the notes tell; so that they stay readable."""
+LEFT_OUT_MAX: Final = 1_000
+"""Names that are not stored, but told: more than any component has, unless it sends noise."""
 
 Kind: TypeAlias = Literal["changed", "first", "added", "removed"]
 
@@ -78,6 +78,7 @@ class Table:
             the count grows with the values that arrive, and only a pause tells the end of the list.
         begins_at_1: whether the component has no index 0, as far as known.
         changed: called with each change, after it is stored.
+        revision: differs where a stored value, its index or its trust may, but for what is verified.
         recounted: called when the count of a complete table changes, or may have changed.
     """
 
@@ -90,6 +91,7 @@ class Table:
         self.volatile: frozenset[str] = frozenset()
         self.volatile_is_known = False
         self.left_out: set[str] = set()
+        self.revision = 0
         self.is_growing = True
         self.begins_at_1 = False
         self.author_of: Callable[[str], str] = lambda name: "vehicle"
@@ -136,7 +138,8 @@ class Table:
         self._encoding = encoding
         if self._held is None:
             received = {name: each for name, each in self.params.items() if each.trust is not Trust.CACHED}
-            self._forget(name for name, each in received.items() if each.type is not ParamType.REAL32)
+            integers = {name for name, each in received.items() if each.type is not ParamType.REAL32}
+            self._forget(integers - self._exact)
         for name, (raw, number) in self._wire.items():
             old = self.params[name]
             new = self.dialect.param(name, raw, number, old.index, encoding)
@@ -154,7 +157,7 @@ class Table:
     def rounded(self) -> set[str]:
         """Names of integers that may stand for others: a C-cast PARAM_VALUE rounds them to float32."""
         names = self.params.keys() - self._exact if self._encoding is Encoding.C_CAST else ()
-        return {name for name in names if _is_rounding(self.params[name])}
+        return {name for name in names if _may_be_rounded(self.params[name])}
 
     def listed_bits(self) -> dict[str, int]:
         """Return the bits of the parameters that have an index, by name."""
@@ -197,7 +200,7 @@ class Table:
         if self._held is not None:
             self._wire[name] = (raw, number)
         self._put(name, old, new)
-        if is_exact:
+        if is_exact and not (old and self.is_reported(old, raw, number)):  # else it may be the old one
             self._exact.add(name)
 
     def _take_count(self, name: str, count: int, index: int) -> int | None:
@@ -276,8 +279,7 @@ class Table:
             self.params[name] = replace(old, index=index, default=default)
             return
         self.moments[name] = moment
-        if self._held is not None:
-            self._wire[name] = (raw, kind)
+        self._wire.pop(name, None)  # it has no encoding
         self._put(name, old, new)
         self._exact.add(name)
 
@@ -289,11 +291,10 @@ class Table:
         self._outdated.discard(name)
 
     def _may_store(self, name: str) -> bool:
-        if is_portable_name(name):
-            return True
-        if len(self.left_out) < LEFT_OUT_MAX:
+        is_stored = is_portable_name(name)
+        if not is_stored and len(self.left_out) < LEFT_OUT_MAX:
             self.left_out.add(name)
-        return False
+        return is_stored
 
     def complete(self) -> None:
         """Drop the parameters that a complete list no longer has."""
@@ -313,6 +314,7 @@ class Table:
     def _drop(self, name: str) -> Param:
         self.moments.pop(name, None)
         self._wire.pop(name, None)
+        self._exact.discard(name)
         return self.params.pop(name)
 
     def recount(self, count: int) -> None:
@@ -339,6 +341,7 @@ class Table:
 
     def _put(self, name: str, old: Param | None, new: Param) -> None:
         self.params[name] = new
+        self.revision += old != new
         if old is not None and old.same_value(new):
             return
         self._exact.discard(name)
@@ -370,8 +373,10 @@ class Table:
 
     def doubt(self, *names: str) -> None:
         """Mark values as cached, or all: the component may have others by now."""
+        self.revision += 1
         for name in self.params.keys() & (names or self.params):
             self.params[name] = self.params[name].with_trust(Trust.CACHED)
+            self._exact.discard(name)
 
     def verify(self) -> None:
         """Mark the cached values that the confirmed hash covers as verified."""
@@ -381,7 +386,7 @@ class Table:
     def prove(self, checksum: int) -> None:
         """Take a checksum that covers the whole table, and mark the cached values as verified."""
         self._hash, self._hash_is_stale = checksum, False
-        self._exact.update(self.params)
+        self._exact.update(self.names.values())
         self._verify(but=frozenset())
 
     def _verify(self, *, but: frozenset[str]) -> None:
@@ -445,8 +450,6 @@ class Table:
             if old is None:
                 self.params[param.name] = param.with_trust(Trust.CACHED)
                 self.moments[param.name] = moments[param.name]
-                if hash is not None:
-                    self._exact.add(param.name)
             elif old.type == param.type:
                 index = old.index if old.index is not None or not has_indices else param.index
                 default = old.default if old.default is not None else param.default
@@ -492,7 +495,5 @@ class Table:
             self._hash_is_stale = self._hash is not None
 
 
-def _is_rounding(param: Param) -> bool:
-    """Return whether the value is an integer to which a float32 rounds others: a multiple of 24 digits."""
-    whole = abs(int(param.value)) if param.type is ParamType.INT32 and not param.is_raw else 0
-    return whole >= FLOAT32_EXACT > whole // (whole & -whole)
+def _may_be_rounded(param: Param) -> bool:
+    return param.type is ParamType.INT32 and not param.is_raw and abs(int(param.value)) >= FLOAT32_EXACT

@@ -146,9 +146,10 @@ def listed(session: Session) -> list[ReportedValue]:
 
 
 def whole_list(session: Session) -> list[ReportedValue]:
-    """Return the answers to a request for the list of a table in sync."""
-    values, digest = listed(session), digest_of(session)
-    return values if digest is None else [digest, *values]
+    """Return the answers to a request for the list of a table in sync; empty if it is not complete."""
+    values = listed(session) if session.table.is_complete else []
+    digest = digest_of(session)
+    return values if digest is None or not values else [digest, *values]
 
 
 def known_param(session: Session, name: str | None) -> Param | None:
@@ -177,7 +178,6 @@ class KeptTable(Stream[Change]):
 
     Attributes:
         component, session, source: of the component.
-        changes: the number of changes so far.
         heartbeat, beats: the component's last heartbeat, and how many there were.
     """
 
@@ -188,7 +188,6 @@ class KeptTable(Stream[Change]):
         self.component = component
         self.session = component.session
         self.source = (component.system, component.component)
-        self.changes = 0
         self.heartbeat: Message | None = None
         self.beats = 0
         self._announce = announce
@@ -232,16 +231,15 @@ class KeptTable(Stream[Change]):
     @property
     def state_key(self) -> object:
         """What differs where the list may differ; None while the table is not in sync."""
-        table, component = self.session.table, self.component
-        if component.sync_state is not SyncState.SYNCED:
-            return None
-        return (self.changes, table.count, component.watch.confirmed_at, table.hash, len(table.unverified()))
+        table, watch = self.session.table, self.component.watch
+        state = (table.revision, table.count, watch.confirmed_at, table.hash)
+        return state if self.component.sync_state is SyncState.SYNCED else None
 
     @property
-    def list_if_current(self) -> list[ReportedValue] | None:
-        """The answers to a request for the list; None while the table is not complete and in sync."""
+    def list_if_current(self) -> list[ReportedValue]:
+        """The answers to a request for the list; empty while the table is not complete and in sync."""
         key = self.state_key
-        return None if key is None else self._list_at(key)
+        return [] if key is None else self._list_at(key)
 
     def check(self) -> None:
         """Have a table checked in the background that was not confirmed for a while.
@@ -266,7 +264,6 @@ class KeptTable(Stream[Change]):
 
     def push(self, item: Change) -> None:
         """Take a change, and announce it unless it is a first value."""
-        self.changes += 1
         if item.new is not None and item.kind != "first" and is_decoded(self.session):
             self._announce(self, value_of(self.session, item.new))
 
@@ -293,17 +290,18 @@ class KeptTable(Stream[Change]):
             values: of the list, as they are now.
             sent: takes the index of each value.
         """
-        changes, generation = self.changes, self.component.node.generation
+        table, generation = self.session.table, self.component.node.generation
+        revision = table.revision
 
         def current() -> Iterator[Message]:
             for value in values:
-                param = self.session.table.params.get(value.param_id)
+                param = table.params.get(value.param_id)
                 is_doubtful = param is not None and param.trust is Trust.CACHED
                 if is_doubtful or self.is_lost or self.component.node.generation != generation:
                     return
                 if not sent and self.heartbeat is not None:
                     yield self.heartbeat
-                if self.changes != changes and param is not None:
+                if table.revision != revision and param is not None:
                     now = value_of(self.session, param, index=value.param_index)
                     value = now._replace(param_count=value.param_count)
                 sent.add(value.param_index)
@@ -390,7 +388,7 @@ class KeptTable(Stream[Change]):
 
     def _is_unknown(self, which: Which) -> bool:
         is_beyond = isinstance(which, int) and which not in self.session.table.names
-        is_listed = is_beyond and self.list_if_current is not None
+        is_listed = is_beyond and bool(self.list_if_current)
         is_px4 = self.session.identification.is_px4  # and an ArduPilot takes any case
         is_misspelt = is_px4 and isinstance(which, str) and self.session.spelled(which) != which
         return is_listed or is_misspelt or self._unknown.get(which, -math.inf) > anyio.current_time()

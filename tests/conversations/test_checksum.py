@@ -284,9 +284,7 @@ async def test_a_value_that_is_another_at_each_read_ends_the_search() -> None:
 
 
 @pytest.mark.parametrize(("loss", "delay"), [(0.05, 0.2), (0.2, 0.05), (0.2, 0.2)])
-@pytest.mark.parametrize(
-    "changed", [{}, {"STAT_RUNTIME": 99, "ATC_RAT_RLL_P": 0.25}], ids=["same", "changed"]
-)
+@pytest.mark.parametrize("changed", [{}, {"STAT_RUNTIME": 99, "ATC_RAT_RLL_P": 0.25}], ids=["same", "other"])
 def test_loss_leaves_nothing_wrong(loss: float, delay: float, changed: dict[str, float]) -> None:
     async def main() -> None:
         for seed in range(4):
@@ -354,6 +352,21 @@ async def test_where_it_does_not_work_the_table_is_downloaded(kind: str) -> None
         assert reason in " ".join(result.notes)
         assert ("EK2_ENABLE" in result.changed) == (kind in ("count", "announced later"))
         assert anyio.current_time() - began < 3.0
+
+
+async def test_the_integers_of_a_file_stay_where_the_first_heartbeat_is_behind_it() -> None:
+    vehicle, began = ArduPilotVehicle(live_period=0.0), anyio.current_time()
+
+    def passes(message: Message) -> bool:
+        return not isinstance(message, Heartbeat) or anyio.current_time() > began + 1.8
+
+    async with converse(Tap(vehicle, down=passes)) as conversation:
+        conversation.hear(ParamValue("ATC_RAT_RLL_P", bytes(4), ParamType.REAL32, 1382, NO_INDEX))
+        node = await conversation.node()
+        result = await fetch_all(node.plain)
+        await anyio.sleep(4.0)
+        for params in (result.params, node.plain.table.params):
+            assert all(params[param.name].same_value(param) for param in vehicle.listed)
 
 
 @pytest.mark.parametrize("late", [0.0, 2.0])

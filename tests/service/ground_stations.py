@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -68,7 +69,7 @@ class Partner:
         self.datagrams: list[bytes] = []
         self.frames: list[Frame] = []
         self.times: list[float] = []
-        self.lost: dict[tuple[int, int], int] = {}
+        self.lost = Counter[tuple[int, int]]()
         self.address = (system, component)
         self._version = version
         self._out: list[bytes] = []
@@ -108,9 +109,7 @@ class Partner:
         for frame in self._framer.receive(data):
             source = (frame.system, frame.component)
             if source in self._last:
-                self.lost[source] = self.lost.get(source, 0) + (
-                    frame.sequence - self._last[source] - 1 & 0xFF
-                )
+                self.lost[source] += frame.sequence - self._last[source] - 1 & 0xFF
             self._last[source] = frame.sequence
             self.frames.append(frame)
             self.times.append(now)

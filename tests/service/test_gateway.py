@@ -172,11 +172,8 @@ async def test_rule_1_a_list_that_was_asked_before_the_vehicle_was_heard_is_answ
 
 
 @pytest.mark.parametrize(("system", "expected"), [(1, {1: 26}), (0, {1: 26, 2: 26})])
-async def test_rule_1_such_a_list_is_answered_by_those_of_whom_it_was_asked(
-    system: int, expected: dict[int, int]
-) -> None:
-    both = [Late(small_px4(system=2), 1.0), Late(small_px4(system=1), 2.0)]
-    async with gateway_over(Air(both)) as served:
+async def test_rule_1_such_a_list_is_answered_by_those_asked(system: int, expected: dict[int, int]) -> None:
+    async with gateway_over(Air([Late(small_px4(system=2), 1.0), Late(small_px4(system=1), 2.0)])) as served:
         station = served.partner()
         await station.ask(ParamRequestList(system, system), seconds=3.0)
         await served.clients[0].fetch_all()
@@ -384,6 +381,15 @@ def test_rule_2_a_file_with_defaults_that_are_unknown_is_one_without() -> None:
     assert unknown.content(full, 80) == unknown.content(plain, 80) == known.content(plain, 80)
     assert known.content(full, 80)[:2] == b"\x1c\x67"
     assert unknown.content(full, 80)[:2] == b"\x1b\x67"
+
+
+async def test_rule_2_a_file_passes_where_the_refusal_of_a_set_may_be_rounded() -> None:
+    (model := ArduPilotVehicle(read_only=["BARO_PROBE_EXT"])).load({"BARO_PROBE_EXT": (1 << 25) + 1})
+    async with in_sync(model) as (_, vehicle, station):
+        await station.ask(ParamSet(1, 1, "BARO_PROBE_EXT", struct.pack("<f", 1 << 25), ParamType.INT32))
+        assert await station.ask_file(Opcode.OPEN_FILE_RO, data=b"@PARAM/param.pck", session=5)
+        passed = [Packet.unpack(each.payload).opcode for each in vehicle.messages(FileTransfer)]
+        assert Opcode.OPEN_FILE_RO in passed
 
 
 async def test_rule_2_a_file_passes_while_an_announced_integer_may_be_rounded() -> None:
