@@ -301,11 +301,14 @@ class CacheWriter:
         if self.cache is None:
             raise UsageError("durable needs a cache, and the client has none; open it with a cache")
         if node not in self._identities or not self._is_certain(node):
-            raise CacheError(f"it is not known which vehicle {node.system}/{node.component} is")
+            unknown = f"it is not known which vehicle {node.system}/{node.component} is"
+            raise CacheError(node.plain.encoding_doubt or unknown)
 
     def _is_certain(self, node: Node) -> bool:
-        """Return whether the vehicle and the component are still those that were identified."""
-        return node.identification.is_confirmed and self._vehicles[node].identification.is_confirmed
+        """Return whether the vehicle and the component are still those that were identified, and the values
+        not probably others."""
+        is_confirmed = node.identification.is_confirmed and self._vehicles[node].identification.is_confirmed
+        return is_confirmed and not node.plain.encoding_doubt
 
     def _update(self, node: Node, session: Session, record: TableRecord) -> TableUpdate:
         vehicle = self._vehicles[node]

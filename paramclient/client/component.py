@@ -425,8 +425,7 @@ class Component:
                 return self._fetched(replace(result, elapsed=anyio.current_time() - began), generation)
             if self.session.table.count is None:
                 raise self._nothing(began)
-        is_confirmed = _has(self.params, Trust.VERIFIED)
-        source: FetchSource = "cache" if is_confirmed else "stream"
+        source: FetchSource = "cache" if _has(self.params, Trust.VERIFIED) else "stream"
         return result_of(self.session, source, began, [TIMEOUT_NOTE], policy=self.policy)
 
     async def _listen(self, began: float) -> FetchResult:
@@ -667,8 +666,7 @@ class Component:
             if scope.cancelled_caught:
                 raise NoReply(what, attempts=0, waited=anyio.current_time() - began)
         except NoReply as error:
-            hint = hint_of_node(self.core.station, self.node, anyio.current_time())
-            raise error.with_hint(hint) from None
+            raise error.with_hint(hint_of_node(self.core.station, self.node, anyio.current_time())) from None
 
 
 def _has(params: Mapping[str, Param], trust: Trust) -> bool:

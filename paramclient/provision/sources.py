@@ -254,10 +254,11 @@ def fetched_set(component: Component, result: FetchResult, *, source: str, parti
         partial: whether some parameters may be missing.
 
     Raises:
-        VehicleError: some parameters were not received; the message names them.
+        VehicleError: some parameters were not received, or their encoding is probably wrong.
     """
-    if doubt := component.session.encoding_doubt:
-        source = f"{source} ({doubt})"
+    if (doubt := component.session.encoding_doubt) and not partial:
+        raise VehicleError(doubt, component.system, component.component)
+    source = f"{source} ({doubt})" if doubt else source
     cached = {result.params[name].index: name for name in result.cached}
     indices = sorted({*result.missing, *(index for index in cached if index is not None)})
     missing = [cached.get(index, f"index {index}") for index in indices]

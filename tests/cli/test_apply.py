@@ -207,7 +207,7 @@ def test_the_backup_file_has_the_state_before(command: Command, put: Put, file: 
     assert vehicle.values == copter().values
 
 
-def test_the_backup_of_an_incomplete_table_names_what_it_lacks(
+def test_the_backup_names_what_the_table_lacks(
     command: Command, put: Put, file: File, tmp_path: Path
 ) -> None:
     vehicle, backup = Partial({"A": (1, ParamType.INT32)}, count=lambda index: 2), tmp_path / "b.param"
@@ -482,7 +482,10 @@ def test_metadata_gives_ranges_and_reboots(command: Command, put: Put, file: Fil
 def test_nothing_is_compared_or_set_in_doubtful_encodings(command: Command, put: Put, tmp_path: Path) -> None:
     vehicle = Partial(encoding=Encoding.C_CAST)
     url, saved = put(vehicle), tmp_path / "quad.param"
-    assert command("save", url, saved).code == 0
+    refused = command("save", url, saved)
+    assert (refused.code, "--encoding c-cast" in refused.err, saved.exists()) == (1, True, False)
+    assert "The cache holds no vehicle" in command("show", "1").err
+    assert command("save", url, saved, "--incomplete").code == 0
     assert "(The encoding of 1/1 is probably wrong: " in saved.read_text()
     before = dict(vehicle.values)
     for words in (["apply", url, saved], ["apply", url, saved, "--dry-run"], ["restore", url, saved]):
