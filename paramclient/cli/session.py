@@ -323,21 +323,23 @@ async def sessions(
     link = f"{url}?speed=0" if is_log and not is_live and "?speed=" not in url else url
     more = {"encoding": options.encoding, "listen_only": options.listen_only}
     async with open_client(link, options, cache=options.place, **more) as client:
+
+        def known() -> list[Component]:
+            return [each for each in client.components.values() if each.node.identification.has_parameters]
+
         if choice.is_all:
             with _waiting(client, "vehicles"):
                 try:
                     found = await client.find_autopilots(timeout=deadline.heartbeat_timeout)
                 except NoReply:
-                    heard = (each.node.identification for each in client.components.values())
                     is_needed = client.listens_only or (writes and not options.extended)
-                    if is_needed or not any(each.has_parameters for each in heard):
+                    if is_needed or not known():
                         raise
                     found = []
-            known = [each for each in client.components.values() if each.node.identification.has_parameters]
             if options.extended:
-                found = await _with_parameters([each.ext for each in known])
+                found = await _with_parameters([each.ext for each in known()])
             elif not (writes or client.listens_only):
-                found += await _with_parameters([each for each in known if each not in found])
+                found += await _with_parameters([each for each in known() if each not in found])
             if not found:
                 what = f"a component with {'extended ' * options.extended}parameters"
                 raise NoReply(what, attempts=0, waited=OTHERS_TIMEOUT)

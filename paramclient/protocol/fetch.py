@@ -30,7 +30,7 @@ file."""
 ROUNDS_MAX: Final = 3
 """Downloads, while the table changes during them."""
 NOT_REFRESHED: Final = "The values outside the hash were not read again, because the policy is hash-only."
-LEFT_OUT: Final = "Skipped {}: not every parameter file can hold this name."
+LEFT_OUT: Final = "Skipped {}: not every parameter file can hold such names."
 NOT_READ: Final = "Values outside the vehicle's hash could not be read: {}."
 CHANGED: Final = "Changed since they were cached: {}."
 SHOWN_MAX: Final = 5
@@ -293,7 +293,8 @@ class _Fetch:
                 waited = anyio.current_time() - self._began
                 raise NoReply(f"the parameters of {channel}", attempts=0, waited=waited)
             self.notes.append(LOST)
-        self.notes += [LEFT_OUT.format(repr(name)) for name in sorted(self.table.left_out)]
+        if left_out := sorted(map(repr, self.table.left_out)):
+            self.notes.append(LEFT_OUT.format(first_of(left_out, SHOWN_MAX)))
         if doubt := self.session.encoding_doubt:
             self.notes.append(doubt)
         result = result_of(

@@ -79,8 +79,8 @@ async def _contradiction(session: Session, pack: Pack, data: bytes, count: int |
     known = session.table.count
     if pack.total not in (known or pack.total, count) and await _count(session) != pack.total:
         return f"has {pack.total} parameters, and the cached table {known}"
-    is_ardupilot = session.identification.is_ardupilot  # others may pad it in another way
-    if is_ardupilot and data != encode(pack.entries, with_defaults=pack.with_defaults):
+    # others may pad it in another way
+    if session.identification.is_ardupilot and data != encode(pack.entries, with_defaults=pack.with_defaults):
         return "is a mixture of two tables"
     return ""
 

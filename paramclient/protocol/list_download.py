@@ -286,10 +286,12 @@ class _Download:
             return min(self._attempts_max(), ATTEMPTS_MAX if is_certain else ATTEMPTS_DOUBTFUL)
 
         request, attempts = dialect.request_read(channel.reads_from, index), ATTEMPTS_MAX
-        what = f"index {index} of {channel}"
+        what, slow = f"index {index} of {channel}", 0.0 if self._is_served else timing.slowest
         with channel.inbox((dialect.value, index)) as inbox:
             try:
-                await channel.exchange(request, inbox, accept, what=what, attempts=most, copies=copies)
+                await channel.exchange(
+                    request, inbox, accept, what=what, attempts=most, copies=copies, timeout_min=slow
+                )
                 if not self._may_begin_again():  # else it may be of a list that runs again
                     self.session.serves_reads[int] = True
             except NoReply as error:

@@ -293,8 +293,7 @@ class Session:
             who = str(identification.former), str(identification.identity)
             raise AnotherVehicle(*self.channel.target, *who)
         if is_other or not identification.is_confirmed:
-            waited = anyio.current_time() - began
-            raise NoReply(f"the identity of {self.channel}", attempts=0, waited=waited)
+            raise NoReply(f"the identity of {self.channel}", attempts=0, waited=anyio.current_time() - began)
 
     def ftp_attempts(self) -> Callable[[], int] | None:
         """Return the function for the attempts of a MAVFTP request that begins now; None where it was

@@ -181,10 +181,9 @@ class Watch:
             self._before, self._is_doubted = before, True
             if answer.is_other or answer.digest is not None:
                 table.doubt(*table.names.values())
-        if not answer.is_current or any(param.trust is Trust.CACHED for param in table.params.values()):
-            result = await fetch_all(session, refresh=not answer.is_current)
-            if not result.complete:
-                return
+        is_open = not answer.is_current or any(each.trust is Trust.CACHED for each in table.params.values())
+        if is_open and not (await fetch_all(session, refresh=not answer.is_current)).complete:
+            return
         if answer.digest is not None:
             await read_many(session, [key for key in table.volatile if is_stale(session, key, OUTSIDE_AGE)])
         self._is_doubted = False

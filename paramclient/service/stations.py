@@ -359,7 +359,9 @@ class MavlinkEndpoint:
         noise: Counter[Peer] = Counter()  # bytes outside of frames, and frames, since
         since = anyio.current_time()
         while True:
-            received = await self.link.receive()
+            received = list[tuple[Peer, bytes]]()
+            with anyio.move_on_after(STATION_TIMEOUT):
+                received = await self.link.receive()
             if anyio.current_time() >= since + 1:
                 noise, since = Counter(), anyio.current_time()
             for peer, chunk in received:

@@ -390,9 +390,7 @@ def test_a_fetch_that_is_interrupted_ends_cleanly(number: int, code: int, tmp_pa
 
 
 @pytest.mark.parametrize("kept", [True, False])
-def test_ctrl_c_during_a_fetch_says_what_was_received_and_kept(
-    command: Command, put: Put, tmp_path: Path, kept: bool
-) -> None:
+def test_ctrl_c_in_a_fetch_says_what_is_kept(command: Command, put: Put, tmp_path: Path, kept: bool) -> None:
     cache = ["--cache", tmp_path / "cache"] if kept else ["--no-cache"]
     vehicle = Eventful(PX4Vehicle(burst=1, period=0.2), (30.0, lambda: signal.raise_signal(signal.SIGINT)))
     done = command("fetch", put(vehicle), *cache)
@@ -526,7 +524,7 @@ def test_text_from_the_wire_is_escaped(command: Command, put: Put, tmp_path: Pat
         assert (outcome.out + outcome.err).replace("\n", "").isprintable()
         assert (outcome.out + outcome.err).isascii()
     assert fetched.code == 0
-    assert "not every parameter file can hold this name" in fetched.err
+    assert "not every parameter file can hold such names" in fetched.err
     fetched = command("fetch", url, "--json", "--cache", cache)
     assert list(fetched.json["params"]) == ["[red]B[/red]"]
     assert fetched.out.replace("\n", "").isprintable()

@@ -190,9 +190,7 @@ def test_a_name_that_no_vehicle_has_is_left_out(command: Command, write: Write) 
     assert "(incomplete: without 1 parameter that" in command("show", "new.param").err
 
 
-def test_a_file_is_read_from_the_standard_input(
-    command: Command, write: Write, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_read_from_stdin(command: Command, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     write("quad.param", "A,1", "B,2")
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"A 1\nB 3\n")))
     outcome = command("diff", "quad.param", "-", "--json")

@@ -115,9 +115,7 @@ def test_a_text_that_is_neither_a_number_nor_a_known_name_is_quoted(command: Com
 
 
 @pytest.mark.parametrize("timeout", [[], ["--timeout", "60"]])
-def test_the_error_of_several_vehicles_lists_all_that_send_a_heartbeat(
-    command: Command, put: Put, timeout: list[str]
-) -> None:
+def test_the_error_of_several_vehicles_lists_them(command: Command, put: Put, timeout: list[str]) -> None:
     vehicles = [Late(PX4Vehicle(system=number, table={"GAIN": 4.0}), number / 5) for number in (1, 2, 3, 4)]
     outcome = command("set", put(Air(vehicles)), "GAIN", 5, *timeout)
     assert (outcome.code, outcome.out) == (2, "")

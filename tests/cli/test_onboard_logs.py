@@ -47,7 +47,7 @@ def test_logs_of_every_format_are_compared(command: Command, tmp_path: Path) -> 
         ("import", b"SQLite format 3\0" + bytes(100), "an SQLite database"),
     ],
 )
-def test_a_file_that_is_damaged_or_no_log_is_named(
+def test_a_damaged_log_is_named(
     command: Command, tmp_path: Path, name: str, content: bytes, kind: str
 ) -> None:
     (path := tmp_path / "broken.log").write_bytes(content)

@@ -102,9 +102,11 @@ def test_cached_parameters_in_no_list_are_counted_apart(command: Command, put: P
 
 
 def test_a_file_from_the_cache_says_what_it_lacks(command: Command, put: Put, tmp_path: Path) -> None:
-    command("fetch", put(Partial({**TABLE, "RC MAP": (1.0, ParamType.REAL32)})))
-    command("save", "1", path := tmp_path / "quad.json")
-    assert "8 of 9 parameters are in the cache" in path.read_text()
+    link = put(Partial({**TABLE, **{f"RC {at}": (1.0, ParamType.REAL32) for at in range(12)}}))
+    assert "Skipped 'RC 0', 'RC 1', 'RC 10', 'RC 11', 'RC 2' and 7 more: " in command("fetch", link).err
+    for source, lacks in {"1": "8 of 20 parameters are in the cache", link: "without 'RC 0', 'RC 1'"}.items():
+        command("save", source, path := tmp_path / "quad.json")
+        assert lacks in path.read_text()
 
 
 @pytest.mark.parametrize("ending", ["params", "param", "json"])

@@ -50,9 +50,7 @@ def test_search_reports_that_nothing_was_found(command: Command) -> None:
     assert of_described.err == "paramclient: nothing found; 903 parameters searched\n"
 
 
-def test_search_prints_a_value_that_all_vehicles_have_and_the_number_of_different_ones(
-    command: Command, put: Put
-) -> None:
+def test_search_prints_a_value_of_all_vehicles_and_the_number_of_others(command: Command, put: Put) -> None:
     for system in (1, 2, 3):
         table = {"GAIN_P": 4.0, "GAIN_I": system / 2, "GAIN_D": min(system, 2)}
         assert command("fetch", put(PX4Vehicle(system=system, table=table))).code == 0

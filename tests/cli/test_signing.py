@@ -62,9 +62,7 @@ def test_link_reports_signatures(put: Put, key_file: Path, command: Command) -> 
     assert re.search(r": 0 frames proven, [1-9]\d* refused: unsigned\n", shown.out)
 
 
-def test_a_key_is_set_changed_and_removed_each_with_its_proof(
-    put: Put, key_file: Path, tmp_path: Path, command: Command
-) -> None:
+def test_a_key_is_set_changed_and_removed(put: Put, key_file: Path, tmp_path: Path, command: Command) -> None:
     url = put(vehicle := small_px4())
     fresh = a_key_file(tmp_path / "fresh.key", base64.b64encode(OTHER_KEY.secret))
     setup = ("signing", "setup", url, "--link-is-safe", "--timeout", 4, "--signing-key")

@@ -167,7 +167,7 @@ def test_a_vehicle_that_appears_during_the_metadata_download_is_not_written_to(
 
 
 @pytest.mark.parametrize("dry", [[], ["--dry-run"]])
-def test_values_of_an_ambiguous_source_are_not_used(
+def test_no_ambiguous_source_is_used(
     command: Command, monkeypatch: pytest.MonkeyPatch, dry: list[str]
 ) -> None:
     target, (one, two) = px4(5), (px4(), copter())
@@ -181,9 +181,7 @@ def test_values_of_an_ambiguous_source_are_not_used(
 # time
 
 
-def test_a_simulated_link_is_not_searched_for_a_second_vehicle(
-    command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_simulated_link_has_no_second_vehicle(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     behind(monkeypatch, URL)(SimLink(Air([Air([px4()])]), "sim:px4"))
     assert command("set", URL, "MC_ROLL_P", "7", "--timeout", "0.9").code == 0
 

@@ -202,9 +202,8 @@ async def test_a_file_that_is_not_valid_leads_to_the_list_and_drops_nothing(cont
     async with talking(vehicle) as (conversation, session):
         first = await fetch_all(session)
         if content is None:
-            content = encode([PackedParam(each.name, each.type, each.bits ^ 1) for each in vehicle.listed])[
-                :-7
-            ]
+            rows = [PackedParam(each.name, each.type, each.bits ^ 1) for each in vehicle.listed]
+            content = encode(rows)[:-7]
         vehicle.files.update(dict.fromkeys(("@PARAM/param.pck", "@PARAM/param.pck?withdefaults=1"), content))
         second = await fetch_all(session, refresh=True)
         assert (first.source, second.source) == ("ftp", "stream")

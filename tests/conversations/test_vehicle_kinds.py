@@ -456,7 +456,7 @@ async def test_the_encoding_is_looked_for_once_and_within_a_round_trip(maker: ty
 
 @pytest.mark.parametrize(("first", "delay"), [(0, 0.0), (1, 0.0), (0, 0.8)])
 @pytest.mark.parametrize("serves", [EVERYTHING, ("list",), ("names", "indices"), ("indices",)], ids="+".join)
-async def test_a_component_without_heartbeat_is_found_by_both_ids(
+async def test_a_silent_component_is_found_by_both_ids(
     serves: tuple[str, ...], first: int, delay: float
 ) -> None:
     bridge = Partial(serves=serves, first=first, heartbeat=None, component=240)

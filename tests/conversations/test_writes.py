@@ -298,8 +298,7 @@ async def test_changes_are_received_in_their_order(vehicle: Vehicle, reorder: fl
 
 async def test_no_set_is_sent_before_the_encoding_is_certain() -> None:
     vehicle = Partial(NUMBER, encoding=Encoding.C_CAST)
-    endpoint = Tap(vehicle, up=lambda message: not isinstance(message, CommandLong))
-    async with talking(endpoint) as (_, session):
+    async with talking(Tap(vehicle, up=lambda message: not isinstance(message, CommandLong))) as (_, session):
         with anyio.move_on_after(1.0):
             await write(session, "A", 6)
         assert not vehicle.number_of(ParamSet)

@@ -101,8 +101,7 @@ def test_inexpressible_content_fails_before_writing(old: Path) -> None:
 
 def test_errors_of_opening_a_file_have_the_reason(tmp_path: Path) -> None:
     missing = tmp_path / "none.param"
-    error = refused(lambda: read_file(missing))
-    assert str(error) == f"{missing}: cannot be read: No such file or directory"
+    assert str(refused(lambda: read_file(missing))) == f"{missing}: cannot be read: No such file or directory"
     assert "cannot be read: not a regular file" in str(refused(lambda: read_file(tmp_path)))
     assert "cannot be read: embedded null byte" in str(refused(lambda: read_file("a\0b")))
     assert "cannot be written: embedded null byte" in str(refused(lambda: write_file("a\0b.parm", PARAMS)))

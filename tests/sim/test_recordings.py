@@ -196,8 +196,7 @@ def test_px4_full_download() -> None:
     found = [vehicle.param(each) for each in BAROMETER]
     for param in found:
         vehicle.set_param(param.name, -1)
-    events = [(1.4147, param.name, param.value) for param in found]
-    sent = replay(vehicle, name, phase=0.19, on_board=events)
+    sent = replay(vehicle, name, phase=0.19, on_board=[(1.4147, each.name, each.value) for each in found])
     assert differences(name, compared(from_vehicle(name)), compared(sent), burst=20) == []
 
 
