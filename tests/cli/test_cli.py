@@ -564,7 +564,7 @@ def test_a_rate_is_that_of_a_while(command: Command, monkeypatch: pytest.MonkeyP
 
 
 def test_progress_is_drawn_on_a_terminal(tmp_path: Path) -> None:
-    shown = on_terminal("fetch", "sim:px4", "--no-cache")
+    shown = on_terminal("fetch", "sim:px4?rate=20000", "--no-cache")
     assert shown.code == 0
     assert re.search(r"fetching 1/1 PX4 quadrotor .*[0-9]+/903 [0-9]+/s, [0-9]+ s left", shown.out)
     assert "\x1b[1m" in shown.out  # the heading of the table
