@@ -20,7 +20,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from typing import NamedTuple
 
@@ -105,11 +105,12 @@ def babble(port: int) -> None:
 
 
 def stare(port: int) -> None:
-    """Ask for lists and read none, until the process is ended."""
-    with socket.create_connection(("127.0.0.1", port)) as station:
-        while True:
-            station.sendall(encode(ParamRequestList(1, 1), system=252, component=190, sequence=0))
-            time.sleep(0.05)
+    """Ask for lists and read none, until the process is ended; the gateway ends the connection sometimes."""
+    while True:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port)) as station:
+            while True:
+                station.sendall(encode(ParamRequestList(1, 1), system=252, component=190, sequence=0))
+                time.sleep(0.05)
 
 
 @contextmanager
