@@ -53,6 +53,8 @@ PLANES_AND_ROVERS: Final = frozenset({1, 10, 11})
 """MAV_TYPE of these, boats included."""
 PRESSURE_DRIFT: Final = 0.001
 """Share by which these change in between."""
+PRESSURE_CHANGE: Final = 0.3
+"""Share by which they change between days and places: the checksum of one row alone shows its value."""
 SECONDS_SLACK: Final = 40.0
 """By how much these may differ from the time that has passed: they are stored every 30 s."""
 PASSED_MAX: Final = 86_400.0
@@ -145,12 +147,13 @@ class _Proof:
         self._always = self._named(PRESSURE) if measures else set[int]()  # rows that always move
         seconds = self._named(SECONDS)
         names = {BOOT_COUNT, *table.volatile, *table.rounded}
-        self._moving = self._always | seconds  # rows that may have moved
-        self._moving |= {at for at, row in enumerate(rows) if row.name in names}
+        # rows that may have moved
+        self._moving = self._always | seconds | {at for at, row in enumerate(rows) if row.name in names}
         is_first = any(param.trust is Trust.CACHED for param in table.params.values())
         is_slow = is_first and (session.channel.timing.round_trip or 0.0) > SLOW_ROUND_TRIP
         passed = {at for at in seconds if is_first and now - table.moments.get(rows[at].name, now) >= 1}
-        self._alone = passed | ({0} if is_slow else set())  # compared first; 0 shows the count
+        # compared first; 0 shows the count, unless a range before the values that always move does
+        self._alone = passed | ({0} if is_slow and not self._always else set())
 
     async def run(self) -> bool:
         """Compare, and read what differs, until nothing does. Return whether one checksum proves all rows.
@@ -253,7 +256,7 @@ class _Proof:
         passed = now - self._session.table.moments.get(row.name, now)
         if len(place) == 1 or place[-1] in self._always:
             for at, bits in self._explanations(place, difference):
-                if at == place[-1] and _has_just_moved(row, bits, passed):
+                if at == place[-1] and _has_just_moved(row, bits, passed, is_alone=len(place) == 1):
                     yield at, bits
 
     def _guess(self, place: range, difference: int) -> dict[int, int]:
@@ -372,15 +375,15 @@ class _Proof:
         return True
 
 
-def _has_just_moved(row: PackedParam, bits: int, passed: float) -> bool:
+def _has_just_moved(row: PackedParam, bits: int, passed: float, *, is_alone: bool) -> bool:
     """Return whether a value has grown by the seconds that have passed, or by fewer of them, as the vehicle
-    was off meanwhile; or is the same day's pressure."""
+    was off meanwhile; or is the same day's pressure, or alone any pressure."""
     old, new = float(from_bits(row.bits, row.type)), float(from_bits(bits, row.type))
     if SECONDS.fullmatch(row.name) and row.type is ParamType.INT32:
         fewest = 1 if passed <= PASSED_MAX else passed - SECONDS_SLACK
         return new > old and fewest <= new - old <= passed + SECONDS_SLACK
     is_pressure = PRESSURE.fullmatch(row.name) and row.type is ParamType.REAL32
-    return bool(is_pressure) and 0 < abs(new - old) <= PRESSURE_DRIFT * old
+    return bool(is_pressure) and 0 < abs(new - old) <= (PRESSURE_CHANGE if is_alone else PRESSURE_DRIFT) * old
 
 
 def _bits_to_write(bits: int, kind: ParamType) -> float:

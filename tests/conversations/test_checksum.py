@@ -155,7 +155,7 @@ async def test_pressure_that_moves_between_answers_costs_nothing(after: int, is_
         result = await fetched(vehicle, node)
         assert (result.source, result.changed) == ("cache", ())
         assert anyio.current_time() - began < 0.15 + 0.2 * is_lost
-        assert len(set(conversation.sent_of(FileTransfer))) == 5
+        assert len(set(conversation.sent_of(FileTransfer))) == 4
 
 
 async def test_values_that_move_are_read_by_their_checksum_and_learnt() -> None:
