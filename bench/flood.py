@@ -2,10 +2,10 @@
 
     python bench/flood.py [--seconds 60] [--requests 10000]
 
-`paramclient serve` runs with ten simulated vehicles on a link. While one station sends
-10,000 requests a second, one random bytes and one asks for lists that it never reads, a further one fetches
-all parameters of a vehicle again and again. Then 20 stations fetch those of all vehicles at once. Each value
-is compared with that of its vehicle.
+`paramclient serve` runs with ten simulated vehicles on a link. While one station sends 10,000 requests a
+second, one random bytes and one asks for lists that it never reads, a further one fetches all parameters of a
+vehicle again and again. Then 20 stations fetch those of all vehicles at once. Each value is compared with that
+of its vehicle.
 
 Prints a Markdown table: megabytes of resident memory, seconds of one fetch, and values.
 """
@@ -19,16 +19,19 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple
+from multiprocessing.process import BaseProcess
+from typing import TypeAlias
 
 import anyio
 from peers import free_port, machine
 
-from paramclient import Component, Param, ParamClient
+from paramclient import Param, ParamClient
 from paramclient.links import create_link, serve_endpoint
+from paramclient.protocol.fetch import differing
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.wire.messages import Message, ParamRequestList, ParamRequestRead, encode
 
@@ -47,31 +50,26 @@ REQUESTS: list[Message] = [
 ]
 """What the flood consists of."""
 
+Vehicles: TypeAlias = Mapping[int, Mapping[str, Param]]
+"""The parameters of vehicles, by system id."""
+
 spawn = multiprocessing.get_context("spawn")
 
 
-class Row(NamedTuple):
+@dataclass
+class Row:
     """What was measured while one thing happened."""
 
     name: str
-    megabytes: list[float]
-    seconds: list[float]
+    megabytes: list[float] = field(default_factory=list)
+    seconds: float = 0.0  # of the slowest fetch
     values: int = 0
     wrong: int = 0
 
     def __str__(self) -> str:
         first, most, last = self.megabytes[0], max(self.megabytes), self.megabytes[-1]
-        slowest = f"{max(self.seconds):.2f}" if self.seconds else ""
-        cells = (
-            self.name,
-            f"{first:.0f}",
-            f"{most:.0f}",
-            f"{last:.0f}",
-            slowest,
-            f"{self.values:,}",
-            self.wrong,
-        )
-        return f"| {' | '.join(map(str, cells))} |"
+        memory = f"{first:.0f} | {most:.0f} | {last:.0f}"
+        return f"| {self.name} | {memory} | {self.seconds:.2f} | {self.values:,} | {self.wrong} |"
 
 
 def fleet() -> list[PX4Vehicle | ArduPilotVehicle]:
@@ -114,9 +112,8 @@ def stare(port: int) -> None:
 
 
 @contextmanager
-def running(*tasks: tuple[object, ...]) -> Iterator[None]:
-    """Run functions with their arguments, each in a process of its own."""
-    processes = [spawn.Process(target=each, args=rest) for each, *rest in tasks]  # type: ignore[arg-type]
+def running(*processes: BaseProcess) -> Iterator[None]:
+    """Run processes until the end of the block."""
     for each in processes:
         each.start()
     try:
@@ -133,70 +130,59 @@ def megabytes(process: int) -> float:
     return int(shown.stdout) / 1024
 
 
-def wrong_values(component: Component, expected: Mapping[str, Param]) -> int:
-    """Return the number of parameters that are missing, or others than the vehicle's."""
-    got = component.params
-    return sum(name not in got or not got[name].same_value(param) for name, param in expected.items())
-
-
-async def fetch(
-    link: str, system: int, vehicles: Mapping[int, Mapping[str, Param]]
-) -> tuple[float, int, int]:
-    """Fetch all parameters of these vehicles; return the seconds, and how many there were, and wrong ones."""
+async def fetch(link: str, system: int, vehicles: Vehicles, row: Row) -> None:
+    """Fetch all parameters of these vehicles, and add to the row what it took and gave."""
     async with ParamClient(link, cache=False, system=system) as client:
         components = [await client.component(each, 1, timeout=TIMEOUT) for each in vehicles]
         began = time.monotonic()
         async with anyio.create_task_group() as tasks:
             for each in components:
                 tasks.start_soon(each.fetch_all)
-        seconds = time.monotonic() - began
-        wrong = sum(wrong_values(each, vehicles[each.system]) for each in components)
-        return seconds, sum(len(each.params) for each in components), wrong
+        row.seconds = max(row.seconds, time.monotonic() - began)
+        row.values += sum(len(each.params) for each in components)
+        row.wrong += sum(len(differing(vehicles[each.system], each.params)) for each in components)
 
 
-async def watch_memory(process: int, into: list[float]) -> None:
-    """Note the memory twice a second, until cancelled."""
-    while True:
-        into.append(megabytes(process))
-        await anyio.sleep(0.5)
+@asynccontextmanager
+async def watched(process: int, row: Row) -> AsyncIterator[None]:
+    """Note the memory of a process at the begin, twice a second, and at the end."""
+
+    async def watch() -> None:
+        while True:
+            row.megabytes.append(megabytes(process))
+            await anyio.sleep(0.5)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(watch)
+        yield
+        tasks.cancel_scope.cancel()
+    row.megabytes.append(megabytes(process))
 
 
 async def measure(process: int, udp: int, tcp: int, options: argparse.Namespace) -> list[Row]:
     """Return the rows of the table."""
-    vehicles: dict[int, Mapping[str, Param]] = {each.system: each.params for each in fleet()}
+    vehicles: Vehicles = {each.system: each.params for each in fleet()}
     links = [f"udpout:127.0.0.1:{udp}", f"tcp:127.0.0.1:{tcp}"]
-
-    async def take(row: Row, link: str, system: int, some: Mapping[int, Mapping[str, Param]]) -> Row:
-        seconds, values, wrong = await fetch(link, system, some)
-        row.seconds.append(seconds)
-        return row._replace(values=row.values + values, wrong=row.wrong + wrong)
-
-    rows = [await take(Row(f"{VEHICLES} vehicles, 1 station", [], []), links[0], 200, vehicles)]
+    one = Row(f"{VEHICLES} vehicles, 1 station")
+    bad = Row(f"{options.requests:,} requests a second, random bytes, and lists that are not read")
+    many = Row(f"{STATIONS} stations at once, in one process")
+    await fetch(links[0], 200, vehicles, one)
     await anyio.sleep(SETTLING_TIME)
-    rows[0].megabytes.append(megabytes(process))
-    row = Row(f"{options.requests:,} requests a second, random bytes, and lists that are not read", [], [])
-    bad = (flood, udp, options.requests), (babble, tcp), (stare, tcp)
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(watch_memory, process, row.megabytes)
-        with running(*bad):
+    one.megabytes.append(megabytes(process))
+    stations = (
+        spawn.Process(target=flood, args=(udp, options.requests)),
+        spawn.Process(target=babble, args=(tcp,)),
+        spawn.Process(target=stare, args=(tcp,)),
+    )
+    async with watched(process, bad):
+        with running(*stations):
             ends_at = time.monotonic() + options.seconds
             while time.monotonic() < ends_at:
-                row = await take(row, links[0], 201, {1: vehicles[1]})
-        tasks.cancel_scope.cancel()
-    rows.append(row)
-    many = [Row(f"{STATIONS} stations at once", [], [])]
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(watch_memory, process, many[0].megabytes)
-
-        async def one(number: int) -> None:
-            many.append(await take(many[0], links[number % 2], 200 + number, vehicles))
-
-        async with anyio.create_task_group() as stations:
-            for number in range(STATIONS):
-                stations.start_soon(one, number)
-        tasks.cancel_scope.cancel()
-    values, wrong = sum(each.values for each in many), sum(each.wrong for each in many)
-    return [*rows, Row(many[0].name, many[0].megabytes, [], values, wrong)]  # the stations share a core
+                await fetch(links[0], 201, {1: vehicles[1]}, bad)
+    async with watched(process, many), anyio.create_task_group() as tasks:
+        for number in range(STATIONS):
+            tasks.start_soon(fetch, links[number % 2], 200 + number, vehicles, many)
+    return [one, bad, many]
 
 
 def main() -> int:
@@ -210,7 +196,7 @@ def main() -> int:
     with ExitStack() as stack:
         gateway = stack.enter_context(subprocess.Popen([*command, "--no-cache", "--listen", "127.0.0.1:0"]))
         stack.callback(gateway.terminate)
-        stack.enter_context(running((fly, radio)))
+        stack.enter_context(running(spawn.Process(target=fly, args=(radio,))))
         rows = anyio.run(measure, gateway.pid, udp, tcp, options)
     print("| through the gateway | MB at first | at most | at last | slowest fetch, s | values | wrong |")
     print("|---|---|---|---|---|---|---|")
