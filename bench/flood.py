@@ -3,9 +3,9 @@
     python bench/flood.py [--seconds 60] [--requests 10000]
 
 `paramclient serve` runs with ten simulated vehicles on a link. While one station sends 10,000 requests a
-second, one random bytes and one asks for lists that it never reads, a further one fetches all parameters of a
-vehicle again and again. Then 20 stations fetch those of all vehicles at once. Each value is compared with that
-of its vehicle.
+second, one random bytes and one asks for lists that it never reads, a further one fetches all parameters of
+a vehicle again and again. Then 20 stations fetch those of all vehicles at once. Each value is compared with
+that of its vehicle.
 
 Prints a Markdown table: megabytes of resident memory, seconds of one fetch, and values.
 """
