@@ -117,6 +117,5 @@ async def _request(session: Session) -> Digest | None:
 def _may_prove(session: Session) -> bool:
     identification, table = session.identification, session.table
     has_table = bool(table.names) and table.is_complete
-    is_possible = identification.is_ardupilot and identification.may_serve_file and has_table
-    is_served = session.serves_file is not False and session.serves_checksum is not False
-    return is_possible and is_served and not session.dialect.has_ack
+    has_file = identification.is_ardupilot and identification.may_serve_file and not session.dialect.has_ack
+    return has_file and has_table and False not in (session.serves_file, session.serves_checksum)

@@ -41,10 +41,13 @@ SILENT_SETS_MAX: Final = 3
 ACKS_MAX: Final = 4
 """Acknowledgements of one set: some firmware sends the old value first, and PX4 the new one twice; a link may
 double each."""
+SETS_LATE: Final = 3
 SETS_MIN: Final = 5
-SETS_MAX: Final = 12
+SETS_MAX: Final = 10
+"""Sets after which the value counts as kept: the fewest of them late, and the most on a lossy link, beside
+those that wait for the next read."""
 SETS_TIME: Final = 5.0
-"""Seconds of sets in vain after which the fewest suffice."""
+"""Seconds after which two sets are sent at once; it is late after twice as many."""
 SETS_LOST: Final = 1e-4
 """Probability that all sets are lost, at which a vehicle that keeps the old value has not applied them."""
 QUEUE_WAITS: Final = 3
@@ -114,9 +117,9 @@ async def write(
         session.writing[name] = author
         try:
             async with turn or nullcontext():
-                before = await _read_writable(session, name)
+                began, before = anyio.current_time(), await _read_writable(session, name)
                 try:
-                    result = await _Write(session, vehicles, before, value, report).run()
+                    result = await _Write(session, vehicles, before, value, report, began).run()
                 except (NoReply, LinkError, UnknownParameter, anyio.get_cancelled_exc_class()):
                     session.foreign_set(name, author, anyio.current_time())  # it may be acknowledged yet
                     session.table.doubt(name)
@@ -231,7 +234,9 @@ class _Write:
     Attributes:
         before: the parameter before the first set.
         wanted: the value that proves success.
+        began: when the write began, before the parameter was read.
         attempts: sets that were sent.
+        copies: of the last of them, sent at once.
     """
 
     session: Session
@@ -239,21 +244,19 @@ class _Write:
     before: Param
     value: Value
     report: Callable[[SetResult | None], None]
+    began: float
     attempts: int = 0
 
     def __post_init__(self) -> None:
         self.channel = self.session.channel
         self.name = self.before.name
-        self.wanted = self.before
-        self._began = anyio.current_time()
+        self._encode()
         self._confirm = partial(self.session.confirm, self.vehicles)
-        self._raw = b""
         self._has_other_value = False
         self._has_new_type = False
 
     async def run(self) -> SetResult:
         """Send the set until its outcome is proven: by the wanted value, or by the same other one twice."""
-        self._encode()
         replaced = self.session.replaced.get(self.name)
         if replaced and any(map(self._is_wanted, replaced.params)):  # a late answer would prove it
             await anyio.sleep_until(replaced.until + 0.001)
@@ -271,12 +274,12 @@ class _Write:
                 elif answer.same_value(self.before):
                     sets_max = min(max(self.channel.timing.attempts_for(SETS_LOST), SETS_MIN), SETS_MAX)
                     now = anyio.current_time()
-                    if self.attempts >= (SETS_MIN if now - self._began > SETS_TIME else sets_max):
+                    if self.attempts >= (SETS_LATE if now - self.began > 2 * SETS_TIME else sets_max):
                         if wanted := await self._wanted_behind(inbox, now):
                             return self._result(wanted)
                         raise self._not_applied(answer)
                 elif adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
-                    return self._result(await self._wanted_behind(inbox, self._began) or answer)
+                    return self._result(await self._wanted_behind(inbox, self.began) or answer)
                 else:
                     adjusted = answer
 
@@ -295,16 +298,17 @@ class _Write:
                 inbox,
                 self._accept,
                 what=what,
-                attempts=lambda: 0 if self._has_other_value else SILENT_SETS_MAX,  # a read shows more
+                attempts=lambda: 0 if self._has_other_value else SILENT_SETS_MAX // self.copies,
+                copies=lambda attempt: self.copies,
                 ready=self._confirm,
             )
         until = anyio.current_time() + EXT_PROGRESS_TIMEOUT
         while isinstance(answer, ParamExtAck) and answer.param_result == ExtAckResult.IN_PROGRESS:
             now = anyio.current_time()
-            if now >= until or channel.is_silent(self._began):
+            if now >= until or channel.is_silent(self.began):
                 break
             answer = await channel.wait_for(inbox, self._accept, now, 0, EXT_PROGRESS_READ) or answer
-            if channel.is_silent(self._began):
+            if channel.is_silent(self.began):
                 break
             await self._confirm()
             with suppress(NoReply):  # the final acknowledgement may be lost
@@ -319,12 +323,12 @@ class _Write:
         elif isinstance(answer, Param) and answer.type == self.before.type:
             del self.session.acknowledging[self.name]  # it acknowledges in this type
             return answer
-        if not channel.is_silent(self._began):
+        if not channel.is_silent(self.began):
             with suppress(NoReply):  # only a read shows a changed type, or an extended parameter's value
                 shown = await self._read(inbox)
                 if refused is None or self._is_wanted(shown):  # it was the refusal of another set
                     return shown
-        raise refused or NoReply(what, attempts=self.attempts, waited=anyio.current_time() - self._began)
+        raise refused or NoReply(what, attempts=self.attempts, waited=anyio.current_time() - self.began)
 
     async def _wanted_behind(self, inbox: Inbox, since: float) -> Param | None:
         """Return the wanted value if it comes behind answers to earlier reads, queued by a slow link."""
@@ -339,10 +343,11 @@ class _Write:
         return None
 
     def _request(self, attempt: int) -> Message:
-        """Return the set, and count it as sent."""
-        self.attempts += 1
+        """Return the set, and count its copies as sent."""
+        self.copies = 2 if self.attempts and anyio.current_time() - self.began > SETS_TIME else 1
+        self.attempts += self.copies
         self.report(None)
-        self.session.acknowledging[self.name] += ACKS_MAX
+        self.session.acknowledging[self.name] += self.copies * ACKS_MAX
         self.session.sent[self.name] = self._raw
         return self.session.dialect.set_request(*self.channel.target, self.name, self._raw, self.before.type)
 
