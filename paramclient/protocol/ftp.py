@@ -145,10 +145,9 @@ async def read_file(
         LinkError: the link is closed for good.
     """
     async with channel.ftp, _opened(channel, path, open_attempts) as (session, size):
-        reader = _FileReader(channel, session, path, size_max)
+        reader = _FileReader(channel, session, path, size_max, begun)
         if progress is not None:
             reader.progress = lambda received: progress(received, size)
-        reader.begun = begun
         try:
             return await reader.read()
         except NoReply as error:
@@ -337,9 +336,11 @@ class _Pieces:
 class _FileReader:
     """The read of one open file: a burst from beginning to end, and single reads of lost blocks."""
 
-    def __init__(self, channel: Channel, session: int, path: str, size_max: int) -> None:
+    def __init__(
+        self, channel: Channel, session: int, path: str, size_max: int, begun: Callable[[bytes], None]
+    ) -> None:
         self.progress: Callable[[int], None] = lambda received: None
-        self.begun: Callable[[bytes], None] = lambda head: None
+        self._begun = begun
         self._channel = channel
         self._session = session
         self._path = path
@@ -390,9 +391,8 @@ class _FileReader:
             )
             channel.send(FileTransfer(0, *channel.target, request.pack()))
             self._bursts += 1
-            if await self._take_burst(inbox, max(channel.timing.timeout(attempt), BURST_PAUSE_MIN)):
-                return
-            if self._pieces.reached > offset:
+            is_over = await self._take_burst(inbox, max(channel.timing.timeout(attempt), BURST_PAUSE_MIN))
+            if is_over or self._pieces.reached > offset:
                 return
             if channel.is_silent(self._began):
                 what = f"{self._path} of {channel} at byte {offset}"
@@ -482,7 +482,7 @@ class _FileReader:
             code = FileErrorCode.INVALID_DATA_SIZE
             raise FileTransferError(what, *self._channel.target, path=self._path, code=code)
         if offset == 0:
-            self.begun(data)
+            self._begun(data)
         self._pieces.take(offset, data)
         self._last = anyio.current_time()
         self.progress(self._pieces.received)
