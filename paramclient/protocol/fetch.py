@@ -262,6 +262,7 @@ class _Fetch:
                     return "ftp"
                 self.notes.append(f"Downloaded as a list: {error.reason}.")
                 self._ftp_is_silent = error.is_silent
+        began = anyio.current_time()
         self.listed = await download_list(session)
         by_loss = session.channel.timing.attempts_for(SILENT_LOST) if self.listed.lost else 0
         if self._ftp_is_silent and not self.listed.missing and session.ftp_unanswered >= by_loss:
@@ -269,7 +270,7 @@ class _Fetch:
         with session.channel.gate.until_closed(or_failed=True):
             await session.identification.encoding_certain()
         if not self.listed.missing:
-            self.table.complete()
+            self.table.complete(began)
         return "stream"
 
     async def _read_unverified(self) -> None:

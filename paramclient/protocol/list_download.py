@@ -205,12 +205,13 @@ class _Download:
         while not self._is_over():
             await self._take_for(GAPS_INTERVAL)
         fruitless = 0
-        while (missing := self._missing()) and self._is_served and not self.channel.is_silent(self._began):
-            seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
-            is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
+        while (missing := self._missing()) and not self.channel.is_silent(self._began):
+            may_list = self._is_served or self.session.identification.is_ardupilot  # requests may be lost
+            seconds_more = len(missing) / READS_PER_SECOND_ARDUPILOT - PASS_OVERHEAD
+            is_slower = seconds_more * self._rate() > len(self.table.names)
             has_begun = len(self._received) > self.channel.window_size  # others may answer earlier reads
             is_few = len(missing) < self.channel.window_size
-            if (has_begun and not is_slower) or is_few or fruitless >= FRUITLESS_PASSES_MAX:
+            if not may_list or (has_begun and not is_slower) or is_few or fruitless >= FRUITLESS_PASSES_MAX:
                 return
             self._lost.update(missing)
             await self._next_pass()

@@ -59,12 +59,10 @@ async def read(session: Session, which: str | int) -> ReportedValue:
             return await _read(session, spelled, which)
     known = session.table.params.get(which) if isinstance(which, str) else None
     if known is not None and known.index is not None and _reads_by_index(session):
-        try:
+        with suppress(UnknownParameter, NoReply):  # some answer reads by name only
             answer = await _read(session, known.index)
             if answer.param_id == which:
                 return answer
-        except UnknownParameter:
-            session.serves_reads.setdefault(int, False)
     return await _read(session, which)
 
 
@@ -189,8 +187,7 @@ async def read_param(session: Session, which: str | int) -> Param:
     if known is not None and (isinstance(which, str) or known.index == which):
         return known
     index = message.param_index if message.param_index < message.param_count else None
-    fields = (message.param_id, message.raw, message.param_type, index)
-    return session.dialect.param(*fields, session.table.encoding)
+    return session.dialect.param(*message[:3], index, session.table.encoding)
 
 
 async def read_many(session: Session, names: Iterable[str]) -> None:

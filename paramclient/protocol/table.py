@@ -296,15 +296,16 @@ class Table:
             self.left_out.add(name)
         return is_stored
 
-    def complete(self) -> None:
-        """Drop the parameters that a complete list no longer has."""
+    def complete(self, since: float = math.inf) -> None:
+        """Drop the parameters that a complete list no longer has, but for values that came since then."""
         if not self.is_complete:
             return
         self.was_complete = True
         gone = [
             name
             for name, param in self.params.items()
-            if name in self._outdated or (param.index is not None and self.names.get(param.index) != name)
+            if self.moments[name] < since
+            and (name in self._outdated or (param.index is not None and self.names.get(param.index) != name))
         ]
         self._outdated.clear()
         for name in gone:

@@ -207,9 +207,7 @@ def test_the_backup_file_has_the_state_before(command: Command, put: Put, file: 
     assert vehicle.values == copter().values
 
 
-def test_the_backup_names_what_the_table_lacks(
-    command: Command, put: Put, file: File, tmp_path: Path
-) -> None:
+def test_a_backup_names_what_the_table_lacks(command: Command, put: Put, file: File, tmp_path: Path) -> None:
     vehicle, backup = Partial({"A": (1, ParamType.INT32)}, count=lambda index: 2), tmp_path / "b.param"
     assert command("apply", put(vehicle), file("A,2\n"), "--backup", backup).code == 0
     assert "vehicle 1/1\n# incomplete: 1 of 2 parameters, without index 1\nA,1\n" in backup.read_text()

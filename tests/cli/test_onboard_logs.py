@@ -40,16 +40,14 @@ def test_logs_of_every_format_are_compared(command: Command, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "kind"),
+    ("name", "data", "kind"),
     [
         ("show", b"ULog\x01\x12\x35\x01" + bytes(8) + b"\xff" * 50, "broken.log: "),
         ("import", b"", "neither a telemetry log"),
         ("import", b"SQLite format 3\0" + bytes(100), "an SQLite database"),
     ],
 )
-def test_a_damaged_log_is_named(
-    command: Command, tmp_path: Path, name: str, content: bytes, kind: str
-) -> None:
-    (path := tmp_path / "broken.log").write_bytes(content)
+def test_a_damaged_log_is_named(command: Command, tmp_path: Path, name: str, data: bytes, kind: str) -> None:
+    (path := tmp_path / "broken.log").write_bytes(data)
     done = command(name, path)
     assert (done.code, done.out, kind in done.err, done.err.count("\n")) == (2, "", True, 1)

@@ -167,9 +167,7 @@ def test_a_vehicle_that_appears_during_the_metadata_download_is_not_written_to(
 
 
 @pytest.mark.parametrize("dry", [[], ["--dry-run"]])
-def test_no_ambiguous_source_is_used(
-    command: Command, monkeypatch: pytest.MonkeyPatch, dry: list[str]
-) -> None:
+def test_no_ambiguous_file_is_used(command: Command, monkeypatch: pytest.MonkeyPatch, dry: list[str]) -> None:
     target, (one, two) = px4(5), (px4(), copter())
     links = {URL: SimLink(target, URL), SOURCE: SimLink(Air([one, Late(two, 0.9)]), SOURCE)}
     monkeypatch.setattr(cli_session, "ParamClient", lambda url, **options: ParamClient(links[url], **options))

@@ -42,9 +42,7 @@ def locked(path: Path) -> Iterator[None]:
 
 
 Holding = Callable[[Path], AbstractContextManager[None]]
-UNWRITABLE = pytest.mark.parametrize(
-    "unwritable", [locked, lambda path: full_disk(100)], ids=["locked", "full"]
-)
+UNWRITABLE = pytest.mark.parametrize("unwritable", [locked, lambda _: full_disk(100)], ids=["locked", "full"])
 
 
 HOUR = 3600.0

@@ -53,7 +53,7 @@ class Partial(Puppet):
         super().__init__(self._answers, **options)
         self.values = {name: encode_value(value, kind, encoding) for name, (value, kind) in table.items()}
         self.types = {name: kind for name, (_, kind) in table.items()}
-        self._serves = frozenset(serves)
+        self.serves = set(serves)
         self._indices = {name: first + step * place for place, name in enumerate(table)}
         self.sent_as: dict[str, str] = {}  # other names of parameters
         self._count = count or (lambda index: len(table))
@@ -76,21 +76,21 @@ class Partial(Puppet):
         if getattr(message, "target_component", self._target) != self._target:
             return
         match message:
-            case messages.ParamRequestList() if "list" in self._serves:
+            case messages.ParamRequestList() if "list" in self.serves:
                 yield from map(self._value, self.values)
             case messages.ParamRequestRead(param_index=index, param_id=name):
-                by_index = {at: each for each, at in self._indices.items() if "indices" in self._serves}
-                name = by_index.get(index, "") if index >= 0 else name if "names" in self._serves else ""
+                by_index = {at: each for each, at in self._indices.items() if "indices" in self.serves}
+                name = by_index.get(index, "") if index >= 0 else name if "names" in self.serves else ""
                 if name in self.values:
                     yield self._value(name)
-                elif index >= 0 and "ends" in self._serves:
+                elif index >= 0 and "ends" in self.serves:
                     yield messages.ParamValue("", bytes(4), ParamType.REAL32, self._count(index), index)
             case messages.ParamSet() if self._on_set is not None:
                 yield from self._on_set(message)
             case messages.ParamSet(param_id=name, raw=raw) if name in self.values:
-                if "sets" in self._serves:
+                if "sets" in self.serves:
                     self.values[name] = raw
-                if "acks" in self._serves:
+                if "acks" in self.serves:
                     yield self._value(name, self._ack_type)
-            case messages.CommandLong(command=command) if "commands" in self._serves:
+            case messages.CommandLong(command=command) if "commands" in self.serves:
                 yield messages.CommandAck(command, 3) if self._version is None else self._version

@@ -18,11 +18,9 @@ WITH_DEFAULTS = (DATA / "ardupilot_param_withdefaults.pck").read_bytes()
 TABLE = Path(__file__).parents[2] / "paramclient" / "sim" / "tables" / "ardupilot.csv"
 
 
-def packed(
-    *entries: bytes, number: int | None = None, total: int | None = None, magic: int = 0x671B
-) -> bytes:
-    number = len(entries) if number is None else number
-    return struct.pack("<HHH", magic, number, number if total is None else total) + b"".join(entries)
+def packed(*rows: bytes, number: int | None = None, total: int | None = None, magic: int = 0x671B) -> bytes:
+    number = len(rows) if number is None else number
+    return struct.pack("<HHH", magic, number, number if total is None else total) + b"".join(rows)
 
 
 def entry(name: str, value: bytes = b"\x07", *, kind: int = 1, shared: int = 0) -> bytes:

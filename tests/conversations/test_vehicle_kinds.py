@@ -150,9 +150,14 @@ async def test_a_growing_count_is_complete_at_its_end_only(loss: float, serves: 
             assert not result.complete or len(result.params) == 40
 
 
-@pytest.mark.parametrize("changed", [lambda index: 40 + index % 2, lambda index: 40 - index])
-async def test_a_count_that_changes_within_a_list_ends_it(changed: Callable[[int], int]) -> None:
-    vehicle = Partial(FORTY, serves=("list",), count=changed)
+@pytest.mark.parametrize(
+    ("step", "changed"),
+    [(1, lambda index: 40 + index % 2), (1, lambda index: 40 - index)]
+    + [(0, lambda index, count=count: count) for count in (0, 1, 40, 65_535)],
+)
+async def test_no_value_is_dropped_that_has_just_come(step: int, changed: Callable[[int], int]) -> None:
+    """Where the count changes within the list, or all have the index 0."""
+    vehicle = Partial(FORTY, serves=("list",), step=step, count=changed)
     async with talking(Air.symmetric([vehicle], rate=3_000.0)) as (_, session):
         assert (await fetch_all(session)).params.keys() == FORTY.keys()
 
@@ -218,9 +223,7 @@ async def test_the_first_value_of_a_list_that_is_lost_is_missing_and_no_other() 
 
 @pytest.mark.parametrize(("delay", "idle"), [(0.05, 0.0), (0.3, 0.0), (0.3, 3.0)])
 @pytest.mark.parametrize("first", [0, 1, messages.NO_INDEX])
-@pytest.mark.parametrize(
-    "serves", [EVERYTHING, *((each, "sets", "commands") for each in ("names", "indices"))]
-)
+@pytest.mark.parametrize("serves", [EVERYTHING, *((by, "sets", "commands") for by in ("names", "indices"))])
 async def test_names_in_lower_case_are_found_whatever_the_autopilot(
     serves: tuple[str, ...], first: int, delay: float, idle: float
 ) -> None:
@@ -345,6 +348,22 @@ async def test_a_list_ends_while_others_poll_a_parameter() -> None:
     async with talking(Air.symmetric([polled], delay=0.01)) as (_, session):
         assert (await fetch_all(session)).complete
         assert anyio.current_time() < 20.0
+
+
+async def test_an_early_list_that_is_ignored_is_requested_again() -> None:
+    vehicle = ArduPilotVehicle(boot_time=1.5, ftp=False)
+    async with talking(Air.symmetric([vehicle], delay=0.01)) as (_, session):
+        assert (await fetch_all(session)).complete
+        assert vehicle.requests["PARAM_REQUEST_READ"] < 20
+
+
+async def test_an_ardupilot_may_answer_reads_by_name_only() -> None:
+    vehicle = Partial(heartbeat=ARDUPILOT, encoding=Encoding.C_CAST)
+    async with talking(vehicle) as (_, session):
+        await fetch_all(session)
+        vehicle.serves = {"names", "sets"}
+        session.table.doubt()
+        assert (await write(session, "MODE", 4)).actual == 4
 
 
 async def test_the_answer_to_a_control_read_is_none_to_another_read() -> None:

@@ -158,9 +158,7 @@ def test_a_message_that_pymavlink_does_not_have() -> None:
     """COMPONENT_METADATA: uint32 time_boot_ms, uint32 file_crc, char uri[100] (MAVLink, common.xml)."""
     assert 397 not in dialect.mavlink_map
     assert message_name(397) == "COMPONENT_METADATA"
-    seed = x25crc_slow(
-        b"COMPONENT_METADATA uint32_t time_boot_ms uint32_t file_crc char uri " + bytes((100,))
-    )
+    seed = x25crc_slow(b"COMPONENT_METADATA uint32_t time_boot_ms uint32_t file_crc char uri " + b"\x64")
     extra = seed.crc & 0xFF ^ seed.crc >> 8  # as the serialisation page of the guide has it
     message = messages.ComponentMetadata("mftp://etc/extras/component_general.json.xz", 0x01020304)
     payload = bytes(4) + b"\x04\x03\x02\x01" + message.uri.encode()
