@@ -49,7 +49,8 @@ USB (measured); a 57600 baud radio carries 40."""
 SLOW_LIST: Final = ": a slow port or radio. Raise its rate (PX4: MAV_n_RATE, ArduPilot: SERIALn_BAUD)."
 """Causes of a slow list, and what to do."""
 ENABLE_FTP: Final = "Is MAVFTP on (BRD_OPTIONS, bit 1), and used by no other? Is the firmware 4.1 or newer?"
-"""What to do about an ArduPilot that serves no parameter file."""
+NO_PROOF: Final = {"px4": "Set MAV_HASH_CHK_EN to 1.", "ardupilot": ENABLE_FTP}
+"""What to do about a vehicle that confirms no table, by its autopilot."""
 LESS_LOSS: Final = "Check antenna, distance and baud rate, or send less telemetry on this link."
 """What to do about lost frames."""
 NO_ACKNOWLEDGEMENT: Final = (
@@ -190,9 +191,10 @@ class _Check:
         found |= {"before": hash_text(crc), "bytes": proof.size}
         self.json["hash"], problem = found, found["error"]
         words = f"{found['before']}, {proof.size} bytes in {milliseconds(found['elapsed_s'] or 0.0)}"
-        self.rows.append(("checksum" if is_ardupilot else "hash", f"none: {problem}" if problem else words))
-        if problem and component.autopilot == "px4":
-            self.findings.append(("slow", "Without a hash, sessions download. Set MAV_HASH_CHK_EN to 1."))
+        what = "checksum" if is_ardupilot else "hash"
+        self.rows.append((what, f"none: {problem}" if problem else words))
+        if problem and (advice := NO_PROOF.get(component.autopilot)):
+            self.findings.append(("slow", f"Without a {what}, sessions download. {advice}"))
 
     async def _list(self) -> None:
         """Measure one list download, also if a file download would be faster."""
@@ -224,6 +226,8 @@ class _Check:
         if problem := found["error"] or (missing and f"{missing} of {count} parameters stayed missing"):
             self.code = ExitCode.INCOMPLETE
             self.findings.append(("problem", f"The list could not be downloaded: {problem}."))
+        if doubt := component.session.encoding_doubt:
+            self.findings.append(("problem", doubt))
         if rate and rate < LIST_RATE_SLOW:
             self.findings.append(("slow", f"The list is received at {rate:.0f} values per second{SLOW_LIST}"))
 
@@ -242,7 +246,7 @@ class _Check:
             words += f", {'with' if pack.with_defaults else 'without'} defaults"
         elif self._component.autopilot == "ardupilot":
             text = f"The packed parameter file cannot be read ({found['error']}), so tables are downloaded as"
-            self.findings.append(("slow", f"{text} lists, without defaults. {ENABLE_FTP}"))
+            self.findings.append(("slow", f"{text} lists, without defaults."))
         self.json["files"] = found
         self.rows.append(("parameter file", found["error"] or words))
 

@@ -332,8 +332,7 @@ async def sessions(
                 try:
                     found = await client.find_autopilots(timeout=deadline.heartbeat_timeout)
                 except NoReply:
-                    is_needed = client.listens_only or (writes and not options.extended)
-                    if is_needed or not known():
+                    if client.listens_only or (writes and not options.extended) or not known():
                         raise
                     found = []
             if options.extended:

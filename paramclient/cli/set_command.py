@@ -79,8 +79,7 @@ def _parse_pairs(words: Sequence[str]) -> dict[str, str]:
     Raises:
         UsageError: a name has no value, is invalid, or is given twice.
     """
-    pairs: dict[str, str] = {}
-    left = iter(words)
+    pairs, left = dict[str, str](), iter(words)
     for word in left:
         if word.startswith("-"):  # values may be negative, so that an unknown option would be a name
             raise UsageError(f"Unknown option: {word.partition('=')[0]}. Nothing was written.")

@@ -203,9 +203,7 @@ class _Cached:
         return [(table, info_of(each, name)) for table, each in self._tables if name in table.params]
 
 
-def _rank(
-    name: str, infos: Sequence[ParamInfo], lowered_words: Sequence[str]
-) -> tuple[int, str, str | None] | None:
+def _rank(name: str, infos: Sequence[ParamInfo], words: Sequence[str]) -> tuple[int, str, str | None] | None:
     """Return the rank of a name, the name, and the description that has it; None without all words.
 
     The rank is 0 if all words are in the name, 1 with the short description, 2 elsewhere.
@@ -216,7 +214,7 @@ def _rank(
         texts.append((name, info.short_description, " ".join(named)))
     for rank in range(3):
         for text in (*texts, (name, "")):
-            if all(word in " ".join(text[: rank + 1]).casefold() for word in lowered_words):
+            if all(word in " ".join(text[: rank + 1]).casefold() for word in words):
                 return rank, name, text[1] or None
     return None
 

@@ -483,6 +483,7 @@ def test_nothing_is_compared_or_set_in_doubtful_encodings(command: Command, put:
     refused = command("save", url, saved)
     assert (refused.code, "--encoding c-cast" in refused.err, saved.exists()) == (1, True, False)
     assert "The cache holds no vehicle" in command("show", "1").err
+    assert "The encoding of 1/1 is probably wrong: " in command("check", url, "--json").out
     assert command("save", url, saved, "--incomplete").code == 0
     assert "(The encoding of 1/1 is probably wrong: " in saved.read_text()
     before = dict(vehicle.values)
