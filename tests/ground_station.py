@@ -91,8 +91,7 @@ class Station:
     def _collect(self) -> None:
         for data in self.endpoint.data_to_send():
             (frame,) = frames.Framer(stream=False).receive(data)
-            message = messages.decode(frame)
-            if message is not None:
+            if (message := messages.decode(frame)) is not None:
                 self.log.append((self.now, frame, message))
 
 

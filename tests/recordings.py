@@ -247,9 +247,7 @@ def _series(name: str, log: Messages, unasked: Collection[str]) -> defaultdict[s
             elif message.param_id in unasked:
                 continue
         elif isinstance(message, messages.StatusText):
-            message = messages.StatusText(
-                message.severity, re.sub(r"\([0-9a-f]{8}\)", "(hash)", message.text)
-            )
+            message = messages.StatusText(message.severity, re.sub(r"\([0-9a-f]{8}\)", "(crc)", message.text))
         series[key].append((time, message))
     return series
 

@@ -191,9 +191,7 @@ def test_the_newest_snapshots_are_kept_and_numbers_are_never_used_again(cache: P
 def test_an_interrupted_apply_is_told_from_one_that_has_ended(cache: ParamCache) -> None:
     cache.save(whole_table(1))
     params = cache.state_at("1", 1, cache.store_snapshot("1", 1, reason="by hand").id)
-    made = [
-        cache.store_snapshot(PX4, 1, params, reason="before apply", is_of_operation=True) for _ in range(2)
-    ]
+    made = [cache.store_snapshot(PX4, 1, params, reason="apply", is_of_operation=True) for _ in range(2)]
     cache.end_operation(made[0].id)
     assert [each.ended for each in cache.snapshots("1")] == [None, True, False]
 

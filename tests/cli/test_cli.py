@@ -283,8 +283,7 @@ class Modem(PX4Vehicle):
     """A vehicle with a telemetry radio, and with a message that is in no dialect."""
 
     def data_to_send(self) -> list[bytes]:
-        sent = super().data_to_send()
-        if sent:
+        if sent := super().data_to_send():
             status = b"\x03\x00\x02\x00\xc8\xbe\x60\x28\x2a"
             sent.append(frames.build_frame(109, status, system=51, component=68, sequence=0))
             sent.append(b"\xfd\x01\x00\x00\x00\x33\x44\xff\xff\x7f" + b"abc")

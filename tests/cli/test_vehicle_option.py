@@ -170,8 +170,7 @@ def test_save_writes_vehicles_into_one_file_or_one_each(command: Command, put: P
 
 def test_watch_prints_of_which_vehicle_a_change_is(command: Command, put: Put) -> None:
     def watch(*words: str) -> list[str]:
-        vehicles = px4(), px4(2)
-        url = put(Air([Eventful(each, (6.0, partial(each.set_param, "A", 3.0))) for each in vehicles]))
+        url = put(Air([Eventful(each, (6.0, partial(each.set_param, "A", 3.0))) for each in (px4(), px4(2))]))
         watched = command("watch", url, "A", "--timeout", 20, *words)
         assert watched.code == 0, watched.err
         return watched.out.splitlines()
@@ -210,8 +209,7 @@ def test_a_doubtful_value_is_written_only_after_a_question(
     command: Command, put: Put, at_terminal: Callable[[str], None], tmp_path: Path, name: str, value: str
 ) -> None:
     vehicle = copter()
-    described = metadata_file(tmp_path, A={"min": 0, "max": 10})
-    words = ("set", put(vehicle), name, value, "--metadata", described)
+    words = ("set", put(vehicle), name, value, "--metadata", metadata_file(tmp_path, A={"min": 0, "max": 10}))
     before = dict(vehicle.values)
     refused = command(*words)
     assert (refused.code, vehicle.values) == (2, before)

@@ -309,9 +309,8 @@ async def test_fetch_all_waits_for_a_px4_that_is_starting() -> None:
 
 
 async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
-    async with shell.a_client(
-        shell.generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
-    ) as client:
+    camera = shell.generic(component=100, autopilot=messages.MAV_AUTOPILOT_INVALID)
+    async with shell.a_client(camera) as client:
         assert (await client.fetch_all()).results.keys() == {(1, 100)}
         assert (await client.fetch_all(1)).results.keys() == {(1, 100)}
         with pytest.raises(errors.NoReply, match="system 2"):

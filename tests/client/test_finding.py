@@ -44,9 +44,8 @@ async def test_the_first_autopilot_is_the_component() -> None:
     ],
 )
 async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str) -> None:
-    async with shell.a_client(
-        shell.generic(component=101, autopilot=messages.MAV_AUTOPILOT_INVALID)
-    ) as client:
+    camera = shell.generic(component=101, autopilot=messages.MAV_AUTOPILOT_INVALID)
+    async with shell.a_client(camera) as client:
         with pytest.raises(NoReply) as caught:
             await client.component(**wanted, timeout=2.5)
         error = caught.value

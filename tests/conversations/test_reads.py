@@ -50,8 +50,7 @@ async def test_silence_to_one_read_of_many_is_no_parameter(make: type[Vehicle], 
     vehicle = make()
     async with talking(vehicle) as (_, session):
         await read(session, vehicle.listed[0].name)
-        vehicle_has_roll = "MC_ROLL_P" in vehicle.params
-        if vehicle_has_roll:
+        if vehicle_has_roll := "MC_ROLL_P" in vehicle.params:
             await read(session, "MC_ROLL_P")
         with pytest.raises(UnknownParameter) as caught, anyio.fail_after(3.0):
             await read(session, which)

@@ -55,8 +55,7 @@ class Recorded(Puppet):
             self._answers[key(request)].append(found)
 
     def _answers_to(self, request: messages.Message) -> Iterable[messages.Message]:
-        recorded = self._answers.get(key(request))
-        if recorded is not None:
+        if (recorded := self._answers.get(key(request))) is not None:
             return recorded.pop(0) if len(recorded) > 1 else recorded[0]
         value = isinstance(request, messages.ParamRequestRead) and self._values.get(request.param_id)
         return [value] if value else []

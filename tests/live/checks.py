@@ -137,8 +137,7 @@ class Session:
         wrong: list[str] = []
         for name, param in listed.items():
             if name in before and not before[name].same_value(param):
-                held = await vehicle.get(name)
-                if held.same_value(param):
+                if (held := await vehicle.get(name)).same_value(param):
                     before[name] = param
                 elif not journal.moves_by_itself(name):
                     wrong.append(f"{param} (the vehicle holds {held.value!r})")
@@ -153,8 +152,7 @@ class Session:
     def harmless(self, *types: ParamType) -> str:
         """Return a parameter of one of these types, or of any, that may be changed."""
         by_type = self.choice.by_type
-        names = [by_type[each] for each in types or by_type if each in by_type]
-        if not names:
+        if not (names := [by_type[each] for each in types or by_type if each in by_type]):
             raise Skip(f"no harmless parameter {' or '.join(each.name for each in types)}".rstrip())
         return names[0]
 
@@ -280,8 +278,7 @@ async def set_fraction(session: Session) -> str:
 
 @check("set, refused", "Refused with the reason", writes=True, kinds=("ardupilot",))
 async def set_refused(session: Session) -> str:
-    name = session.choice.read_only
-    if name is None:
+    if (name := session.choice.read_only) is None:
         raise Skip("no parameter is known that the vehicle would refuse to change")
     async with session.client() as vehicle:
         param = await vehicle.get(name)
@@ -300,8 +297,7 @@ async def set_refused(session: Session) -> str:
 @check("30 sets at once", "each accepted, and read back", writes=True)
 async def set_many(session: Session, *, number: int = 30) -> str:
     """Set parameters side by side, read them back, and put them back."""
-    names = session.choice.many[:number]
-    if not names:
+    if not (names := session.choice.many[:number]):
         raise Skip("no harmless parameters")
     wanted = {name: another_value(session.journal.before[name]) for name in names}
     async with session.client() as vehicle:
@@ -347,8 +343,7 @@ async def show_group(session: Session) -> str:
     kinds=("ardupilot", "px4"),
 )
 async def restore_before(session: Session) -> str:
-    names = session.choice.many[:RESTORED]
-    if not names:
+    if not (names := session.choice.many[:RESTORED]):
         raise Skip("no harmless parameters")
     async with session.client() as vehicle:
         await vehicle.fetch_all(timeout=SLOWEST_FETCH)

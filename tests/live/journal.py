@@ -155,8 +155,7 @@ class Journal:
         problem = ""
         for _ in range(PUT_BACK_ATTEMPTS):
             try:
-                held = await vehicle.get(param.name)
-                if held.same_value(param):
+                if (held := await vehicle.get(param.name)).same_value(param):
                     self.changed.pop(param.name, None)
                     return
                 problem = f"the vehicle holds {format_value(held.value, held.type)}"

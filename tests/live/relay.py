@@ -145,8 +145,7 @@ class RealVehicle:
         """See `Endpoint.receive`."""
         if self._conditions.refuses_files:
             for frame in self._framer.receive(data):
-                message = messages.decode(frame)
-                if isinstance(message, messages.FileTransfer):
+                if isinstance(message := messages.decode(frame), messages.FileTransfer):
                     self._incoming.append((now, self._refusal(message, frame)))
                     return
         self.outgoing.append(data)

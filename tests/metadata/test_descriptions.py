@@ -107,8 +107,7 @@ def test_errors_suggest_names(info: ParamInfo, text: str, problem: str) -> None:
 @given(st.integers(0, 2**64 - 1), st.dictionaries(st.integers(0, 63), st.text(max_size=8), max_size=8))
 def test_text_of_a_mask_parses_to_the_same_mask(mask: int, bits: dict[int, str]) -> None:
     info = ParamInfo("A", bits={bit: name for bit, name in bits.items() if name})
-    text = info.text(mask)
-    if text is not None:
+    if (text := info.text(mask)) is not None:
         try:
             again = info.parse(text)
         except UsageError:

@@ -66,8 +66,7 @@ class _Exchange(httpx.AsyncByteStream):
         self._gone.set()
         self.answers.close()
         await asyncio.wait([self._task])
-        error = self._task.exception()
-        if error is not None and self.status != 500:
+        if (error := self._task.exception()) is not None and self.status != 500:
             raise error
 
     async def _run(self, app: ASGIApp, scope: Scope) -> None:

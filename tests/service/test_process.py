@@ -97,8 +97,7 @@ async def test_it_wants_a_token_of_its_file(tmp_path: Path) -> None:
 async def test_connections_have_a_bound() -> None:
     async with served("sim:px4", "--no-cache") as (_, browser), AsyncExitStack() as opened:
         for _ in range(CONNECTIONS_MAX):
-            connection = await anyio.connect_tcp("127.0.0.1", browser.base_url.port or 0)
-            await opened.enter_async_context(connection)
+            await opened.enter_async_context(await anyio.connect_tcp("127.0.0.1", browser.base_url.port or 0))
         assert (await browser.get("/health")).status_code == 503
 
 

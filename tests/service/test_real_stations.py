@@ -39,8 +39,7 @@ def fetch_with_pymavlink(port: int, lists: int = 1) -> tuple[dict[str, float], f
         missing: set[int] | None = None
         master.mav.param_request_list_send(1, 1)
         while missing is None or missing:
-            message = master.recv_match(type="PARAM_VALUE", blocking=True, timeout=1.0)
-            if message is None:
+            if (message := master.recv_match(type="PARAM_VALUE", blocking=True, timeout=1.0)) is None:
                 for index in sorted(missing or ())[:10]:
                     master.mav.param_request_read_send(1, 1, b"", index)
             elif message.param_index < message.param_count:
