@@ -84,8 +84,7 @@ async def settle(session: Session, before: Digest | None, listed: Digest | None,
     table = session.table
     if listed is not None and listed.count == table.count and table.confirm(listed.hash):
         return True
-    after = await _request(session)
-    if after is None:
+    if (after := await _request(session)) is None:
         return True
     if after.count == table.count:
         if table.confirm(after.hash):

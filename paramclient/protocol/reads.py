@@ -60,8 +60,7 @@ async def read(session: Session, which: str | int) -> ReportedValue:
     known = session.table.params.get(which) if isinstance(which, str) else None
     if known is not None and known.index is not None and _reads_by_index(session):
         with suppress(UnknownParameter, NoReply):  # some answer reads by name only
-            answer = await _read(session, known.index)
-            if answer.param_id == which:
+            if (answer := await _read(session, known.index)).param_id == which:
                 return answer
     return await _read(session, which)
 
@@ -93,8 +92,7 @@ async def _read(session: Session, which: str | int, alias: str | int | None = No
                         raise
                     if alias is not None:
                         channel.send(session.dialect.request_read(channel.reads_from, alias))
-                    control = await _control_read(session, which)
-                    if control is None:
+                    if (control := await _control_read(session, which)) is None:
                         is_over = channel.is_lost or bool(alias and inbox)
                         if is_over or (listed := await _read_list(session, inbox, which)) is None:
                             raise

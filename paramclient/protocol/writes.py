@@ -41,13 +41,11 @@ SILENT_SETS_MAX: Final = 3
 ACKS_MAX: Final = 4
 """Acknowledgements of one set: some firmware sends the old value first, and PX4 the new one twice; a link may
 double each."""
-SETS_LATE: Final = 3
 SETS_MIN: Final = 5
 SETS_MAX: Final = 10
-"""Sets after which the value counts as kept: the fewest of them late, and the most on a lossy link, beside
-those that wait for the next read."""
+"""Sets after which the value counts as kept, and more on a lossy link, beside two that await a read."""
 SETS_TIME: Final = 5.0
-"""Seconds after which two sets are sent at once; it is late after twice as many."""
+"""Seconds after which two sets are sent at once; after twice as many, the fewest suffice."""
 SETS_LOST: Final = 1e-4
 """Probability that all sets are lost, at which a vehicle that keeps the old value has not applied them."""
 QUEUE_WAITS: Final = 3
@@ -111,13 +109,15 @@ async def write(
     """
     vehicles = session.identification.vehicles if vehicles is None else vehicles
     _check_finite(session, name, value, force=force)
+    began = anyio.current_time()
     if session.spelled(name) != name:
         name = (await read(session, name)).param_id
+    before_turn = anyio.current_time() - began
     async with session.lock(name):
         session.writing[name] = author
         try:
             async with turn or nullcontext():
-                began, before = anyio.current_time(), await _read_writable(session, name)
+                began, before = anyio.current_time() - before_turn, await _read_writable(session, name)
                 try:
                     result = await _Write(session, vehicles, before, value, report, began).run()
                 except (NoReply, LinkError, UnknownParameter, anyio.get_cancelled_exc_class()):
@@ -234,9 +234,9 @@ class _Write:
     Attributes:
         before: the parameter before the first set.
         wanted: the value that proves success.
-        began: when the write began, before the parameter was read.
+        began: when the write began, before the parameter was read, and without the time for its turn.
         attempts: sets that were sent.
-        copies: of the last of them, sent at once.
+        copies, sent_at: of the last of them, how many were sent at once, and when.
     """
 
     session: Session
@@ -273,9 +273,9 @@ class _Write:
                     return self._result(answer)
                 elif answer.same_value(self.before):
                     sets_max = min(max(self.channel.timing.attempts_for(SETS_LOST), SETS_MIN), SETS_MAX)
-                    now = anyio.current_time()
-                    if self.attempts >= (SETS_LATE if now - self.began > 2 * SETS_TIME else sets_max):
-                        if wanted := await self._wanted_behind(inbox, now):
+                    is_late = anyio.current_time() - self.began > 2 * SETS_TIME
+                    if self.attempts >= (SETS_MIN if is_late else sets_max):
+                        if wanted := await self._wanted_behind(inbox, self.sent_at):
                             return self._result(wanted)
                         raise self._not_applied(answer)
                 elif adjusted is not None and (adjusted.same_value(answer) or self.attempts >= SETS_MAX):
@@ -312,8 +312,7 @@ class _Write:
                 break
             await self._confirm()
             with suppress(NoReply):  # the final acknowledgement may be lost
-                shown = await self._read(inbox)
-                if self._is_wanted(shown):
+                if self._is_wanted(shown := await self._read(inbox)):
                     return shown
         refused = None
         if isinstance(answer, ParamExtAck) and answer.param_result not in EXT_TAKEN:
@@ -344,7 +343,9 @@ class _Write:
 
     def _request(self, attempt: int) -> Message:
         """Return the set, and count its copies as sent."""
-        self.copies = 2 if self.attempts and anyio.current_time() - self.began > SETS_TIME else 1
+        self.sent_at = anyio.current_time()
+        is_late = self.sent_at - self.began > SETS_TIME and not self.session.dialect.has_ack
+        self.copies = 2 if is_late and self.attempts else 1
         self.attempts += self.copies
         self.report(None)
         self.session.acknowledging[self.name] += self.copies * ACKS_MAX
@@ -490,7 +491,6 @@ async def _seek_evidence(session: Session) -> None:
 def _check_finite(session: Session, name: str, value: Value, *, force: bool) -> None:
     if force or not isinstance(value, float) or math.isfinite(value):
         return
-    why = reason_against_non_finite(autopilot_name(session.identification.autopilot or 0))
-    if why:
+    if why := reason_against_non_finite(autopilot_name(session.identification.autopilot or 0)):
         not_sent = f"{name} = {value} was not sent to {session.channel}"
         raise UsageError(f"{not_sent}: {why}. With force (--force) it is sent all the same.")
