@@ -27,6 +27,8 @@ LIST_REQUESTS_MAX: Final = 12
 LIST_REQUESTS_ALONE: Final = 3
 """The first of them; reads of the index 1 or 0 take turns with the others, for firmware without a list. None
 is alone where reads by index were answered, and reads by name were not."""
+EARLY_TIME: Final = 2.0
+"""Seconds in which an ArduPilot that answers other requests gets no such read: it may just have started."""
 LIST_TIMEOUT_MIN: Final = 0.2
 """Seconds to wait for the first value of a list, at least: a second request makes the list begin again."""
 PAUSE_PX4: Final = 0.12
@@ -138,12 +140,14 @@ class _Download:
     async def begin(self) -> None:
         """Request the list until its first value arrives; later a value too, where no list is served."""
         channel, dialect, target = self.channel, self.session.dialect, self.channel.reads_from
+        may_be_early = self.session.identification.is_ardupilot and channel.answered.is_set()
         self._began = anyio.current_time()
 
         def request(attempt: int) -> Message:
             self.session.report(0, self.table.count)
             self._begins_at = anyio.current_time() if attempt else -math.inf
-            if attempt < LIST_REQUESTS_ALONE or attempt % 2 == 0:
+            is_early = may_be_early and anyio.current_time() - self._began < EARLY_TIME
+            if attempt < LIST_REQUESTS_ALONE or is_early or attempt % 2 == 0:
                 if self.session.only_by_index:
                     self._reading.add(1)
                     self.channel.send(dialect.request_read(target, 1))
@@ -205,13 +209,12 @@ class _Download:
         while not self._is_over():
             await self._take_for(GAPS_INTERVAL)
         fruitless = 0
-        while (missing := self._missing()) and not self.channel.is_silent(self._began):
-            may_list = self._is_served or self.session.identification.is_ardupilot  # requests may be lost
-            seconds_more = len(missing) / READS_PER_SECOND_ARDUPILOT - PASS_OVERHEAD
-            is_slower = seconds_more * self._rate() > len(self.table.names)
+        while (missing := self._missing()) and self._is_served and not self.channel.is_silent(self._began):
+            seconds_left = len(self.table.names) / self._rate() + PASS_OVERHEAD
+            is_slower = len(missing) / READS_PER_SECOND_ARDUPILOT > seconds_left
             has_begun = len(self._received) > self.channel.window_size  # others may answer earlier reads
             is_few = len(missing) < self.channel.window_size
-            if not may_list or (has_begun and not is_slower) or is_few or fruitless >= FRUITLESS_PASSES_MAX:
+            if (has_begun and not is_slower) or is_few or fruitless >= FRUITLESS_PASSES_MAX:
                 return
             self._lost.update(missing)
             await self._next_pass()
@@ -256,8 +259,7 @@ class _Download:
         now = anyio.current_time()
         if not self._is_over() or (self.table.is_growing and now - self._listed_at < PAUSE_GROWING):
             return False
-        missing = self._gaps()
-        if missing and now - self._gained_at < QUEUE_TIME:
+        if (missing := self._gaps()) and now - self._gained_at < QUEUE_TIME:
             return False
         attempts_max = self._attempts_max()  # once, where a false count makes thousands of gaps
         given_up = sum(self._tried.get(index, 0) >= attempts_max for index in missing)
@@ -286,8 +288,8 @@ class _Download:
             is_certain = self._is_served or 0 < index < (self._count or 0)
             return min(self._attempts_max(), ATTEMPTS_MAX if is_certain else ATTEMPTS_DOUBTFUL)
 
-        request, attempts = dialect.request_read(channel.reads_from, index), ATTEMPTS_MAX
-        what, slow = f"index {index} of {channel}", 0.0 if self._is_served else timing.slowest
+        request, what = dialect.request_read(channel.reads_from, index), f"index {index} of {channel}"
+        attempts, slow = ATTEMPTS_MAX, 0.0 if self._is_served else min(timing.slowest, QUEUE_TIME)
         with channel.inbox((dialect.value, index)) as inbox:
             try:
                 await channel.exchange(
