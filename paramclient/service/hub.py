@@ -255,8 +255,7 @@ class Target:
             ServiceError: 404, the vehicle provides none.
         """
         identity, store = self.component.identity, self.hub.metadata_store
-        found = await metadata_of(self.component, store=store or False, timeout=timeout)
-        if found is None:
+        if (found := await metadata_of(self.component, store=store or False, timeout=timeout)) is None:
             detail = "The vehicle provides no metadata. Add a file of its firmware: paramclient metadata add."
             raise ServiceError(404, "no-metadata", detail)
         self.metadata, self.described = found, identity

@@ -147,9 +147,10 @@ def listed(session: Session) -> list[ReportedValue]:
 
 def whole_list(session: Session) -> list[ReportedValue]:
     """Return the answers to a request for the list of a table in sync; empty if it is not complete."""
-    values = listed(session) if session.table.is_complete else []
-    digest = digest_of(session)
-    return values if digest is None or not values else [digest, *values]
+    values, digest = listed(session), digest_of(session)
+    if not session.table.is_complete or len(values) < len(session.table.names):
+        return []
+    return values if digest is None else [digest, *values]
 
 
 def known_param(session: Session, name: str | None) -> Param | None:

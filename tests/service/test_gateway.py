@@ -634,7 +634,7 @@ async def test_rule_3_a_value_is_not_served_after_a_set_without_an_answer(silenc
         assert not await station.ask_file(Opcode.OPEN_FILE_RO, data=b"@PARAM/param.pck", seconds=0.1)
         setattr(vehicle, silence, False)
         await station.ask(seconds=2.0)
-        assert by_name(station) == ({"PARAM_01": struct.pack("<f", 5)} if silence == "is_mute" else {})
+        assert by_name(station) == {"PARAM_01": struct.pack("<f", 5 if silence == "is_mute" else 1)}
         assert await listed(station) == 24
 
 
