@@ -204,7 +204,7 @@ class CacheWriter:
         if self.cache is None:
             return
         record = self._record(node, session)
-        if len(record.changes) < PENDING_MAX:
+        if len(record.changes) < PENDING_MAX and not session.encoding_doubt:
             at = min(session.table.moments.get(change.name, math.inf), anyio.current_time())
             record.changes.append((change, at))
         else:
@@ -256,7 +256,8 @@ class CacheWriter:
             return
         async with self._writing:
             certain = [node for node in self._identities if self._is_certain(node)]
-            records = [(node, each, self._record(node, each)) for node in certain for each in node.sessions]
+            sessions = [(node, each) for node in certain for each in node.sessions if not each.encoding_doubt]
+            records = [(node, each, self._record(node, each)) for node, each in sessions]
             taken = [each for each in records if each[2].is_unwritten]
             if not taken and (self._is_synced or not durable):
                 return  # which says nothing of the cache
@@ -300,15 +301,13 @@ class CacheWriter:
         """
         if self.cache is None:
             raise UsageError("durable needs a cache, and the client has none; open it with a cache")
-        if node not in self._identities or not self._is_certain(node):
+        if node.plain.encoding_doubt or node not in self._identities or not self._is_certain(node):
             unknown = f"it is not known which vehicle {node.system}/{node.component} is"
             raise CacheError(node.plain.encoding_doubt or unknown)
 
     def _is_certain(self, node: Node) -> bool:
-        """Return whether the vehicle and the component are still those that were identified, and the values
-        not probably others."""
-        is_confirmed = node.identification.is_confirmed and self._vehicles[node].identification.is_confirmed
-        return is_confirmed and not node.plain.encoding_doubt
+        """Return whether the vehicle and the component are still those that were identified."""
+        return node.identification.is_confirmed and self._vehicles[node].identification.is_confirmed
 
     def _update(self, node: Node, session: Session, record: TableRecord) -> TableUpdate:
         vehicle = self._vehicles[node]

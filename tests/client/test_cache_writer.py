@@ -19,7 +19,7 @@ import anyio.from_thread
 import anyio.lowlevel
 import pytest
 
-from paramclient import Component, FetchResult, ParamCache, ParamClient, Trust, errors
+from paramclient import Component, Encoding, FetchResult, ParamCache, ParamClient, Trust, errors
 from paramclient.client import cache_writer
 from paramclient.client import component as component_module
 from paramclient.model.paramset import ParamSet
@@ -30,6 +30,8 @@ from paramclient.wire import messages
 from tests import shell
 from tests.caches import read_only
 from tests.client.conftest import connected, fetched, table_in
+from tests.conversations.partial import Partial
+from tests.conversations.virtual import losing
 from tests.simulated_on_udp import flying
 
 ODD = ("CAL_ACC0_XOFF", "PARAM_03", "PARAM_07")
@@ -237,6 +239,16 @@ async def test_an_identity_that_arrives_long_after_the_values(path: Path, fetche
 
 
 # Keeping it right
+
+
+async def test_no_value_of_a_wrong_encoding_is_kept_where_the_heartbeat_comes_late(path: Path) -> None:
+    vehicle = Partial(encoding=Encoding.C_CAST, heartbeat=messages.Heartbeat(2, 3, system_status=4))
+    late = losing(6, lambda message: isinstance(message, messages.Heartbeat))
+    async with shell.a_client(shell.Tap(vehicle, down=late), cache=path) as client:
+        component = await client.component(1, 1)
+        assert (await component.fetch_all()).params["MODE"].value == 1084227584
+        await asyncio.sleep(8.0)
+    assert "MODE" not in table_in(path, "1").params
 
 
 @pytest.mark.parametrize("volatile", [("CAL_ACC0_XOFF",), ODD], ids=["proven", "not proven"])
