@@ -401,5 +401,5 @@ def _rows(table: Table) -> list[PackedParam]:
         raise FileUnavailable("the list has a gap, a name twice, or one that no file can contain")
     params = [table.params[name] for name in names]
     if inexact := [each.name for each in params if each.is_raw or each.type not in PACKABLE]:
-        raise FileUnavailable(f"the exact value of {inexact[0]} is not known")
+        raise FileUnavailable(f"the exact value of {inexact[0]} is not known, or of a type that no file has")
     return [PackedParam(each.name, each.type, each.bits) for each in params]

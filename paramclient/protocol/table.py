@@ -202,6 +202,8 @@ class Table:
         self._put(name, old, new)
         if is_exact and not (old and self.is_reported(old, raw, number)):  # else it may be the old one
             self._exact.add(name)
+        elif index >= PARAMETERS_MAX:  # somebody has set it, perhaps to another value of the same float32
+            self._exact.discard(name)
 
     def _take_count(self, name: str, count: int, index: int) -> int | None:
         """Take the count of a value, unless it is false. Return the index; None for a value without one."""
@@ -425,8 +427,7 @@ class Table:
 
     def _forget(self, names: Iterable[str]) -> None:
         for name in list(names):
-            index = self._drop(name).index
-            if index is not None and self.names.get(index) == name:
+            if (index := self._drop(name).index) is not None and self.names.get(index) == name:
                 del self.names[index]
         if not self.params:
             self.clear()
