@@ -202,7 +202,9 @@ class Table:
         self._put(name, old, new)
         if is_exact and not (old and self.is_reported(old, raw, number)):  # else it may be the old one
             self._exact.add(name)
-        elif index >= PARAMETERS_MAX:  # somebody has set it, perhaps to another value of the same float32
+        elif (
+            not is_exact and index >= PARAMETERS_MAX
+        ):  # somebody has set it, perhaps to another value of the same float32
             self._exact.discard(name)
 
     def _take_count(self, name: str, count: int, index: int) -> int | None:
@@ -286,9 +288,6 @@ class Table:
         self._exact.add(name)
 
     def _take_place(self, name: str, index: int) -> None:
-        before = self.names.get(index, name)
-        if before != name and before in self.params and self.params[before].index == index:
-            self._outdated.add(before)
         self.names[index] = name
         self._outdated.discard(name)
 
@@ -299,15 +298,17 @@ class Table:
         return is_stored
 
     def complete(self, since: float = math.inf) -> None:
-        """Drop the parameters that a complete list no longer has, but for values that came since then."""
+        """Drop the parameters that a complete list no longer has. Of those with one index all stay that came
+        since then."""
         if not self.is_complete:
             return
         self.was_complete = True
+        listed = {*self.names.values()}
         gone = [
             name
             for name, param in self.params.items()
-            if self.moments[name] < since
-            and (name in self._outdated or (param.index is not None and self.names.get(param.index) != name))
+            if name in self._outdated
+            or (param.index is not None and name not in listed and self.moments[name] < since)
         ]
         self._outdated.clear()
         for name in gone:

@@ -50,7 +50,7 @@ class Partial(Puppet):
         asked_as: int | None = None,
         **options: Any,
     ) -> None:
-        super().__init__(self._answers, **options)
+        super().__init__(self.answers, **options)
         self.values = {name: encode_value(value, kind, encoding) for name, (value, kind) in table.items()}
         self.types = {name: kind for name, (_, kind) in table.items()}
         self.serves = set(serves)
@@ -72,7 +72,7 @@ class Partial(Puppet):
         sent_as = self.sent_as.get(name, name)
         return messages.ParamValue(sent_as, self.values[name], kind, self._count(index), index)
 
-    def _answers(self, message: messages.Message) -> Iterable[messages.Message]:
+    def answers(self, message: messages.Message) -> Iterable[messages.Message]:
         if getattr(message, "target_component", self._target) != self._target:
             return
         match message:

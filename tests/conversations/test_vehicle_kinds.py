@@ -366,11 +366,11 @@ async def test_a_list_ends_while_others_poll_a_parameter() -> None:
         assert anyio.current_time() < 20.0
 
 
-async def test_an_early_list_that_is_ignored_is_requested_again() -> None:
-    vehicle = ArduPilotVehicle(boot_time=1.5, ftp=False)
-    async with talking(Air.symmetric([vehicle], delay=0.01)) as (_, session):
-        assert (await fetch_all(session)).complete
-        assert vehicle.requests["PARAM_REQUEST_READ"] < 20
+async def test_a_parameter_that_goes_within_a_list_is_gone() -> None:
+    before, after = (Partial(dict([*FORTY.items()][first:]), serves=["list"]) for first in (0, 1))
+    puppet = Puppet(lambda each: [*[*before.answers(each)][:20], *after.answers(each)], heartbeat=QUIET)
+    async with talking(puppet) as (_, session):
+        assert (await fetch_all(session)).params.keys() == FORTY.keys() - {"P00"}
 
 
 async def test_an_ardupilot_may_answer_reads_by_name_only() -> None:

@@ -62,8 +62,7 @@ class HidingGroup(ArduPilotVehicle):
     """An ArduPilot that answers no reads by name for the parameters of a hidden group."""
 
     def respond(self, message: messages.Message, sender: frames.Frame) -> None:
-        name = getattr(message, "param_id", "")
-        if not name or name in self.params:
+        if not (name := getattr(message, "param_id", "")) or name in self.params:
             super().respond(message, sender)
 
 

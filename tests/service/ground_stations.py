@@ -107,8 +107,7 @@ class Partner:
     def receive(self, data: bytes, now: float) -> None:
         self.datagrams.append(data)
         for frame in self._framer.receive(data):
-            source = (frame.system, frame.component)
-            if source in self._last:
+            if (source := (frame.system, frame.component)) in self._last:
                 self.lost[source] += frame.sequence - self._last[source] - 1 & 0xFF
             self._last[source] = frame.sequence
             self.frames.append(frame)

@@ -45,8 +45,7 @@ async def until(
 ) -> dict[str, Any]:
     """The vehicle at an address, as soon as it is so; without ids, the whole list."""
     for _ in range(1000):
-        found = await vehicle(browser, address)
-        if found is not None and is_so(found):
+        if (found := await vehicle(browser, address)) is not None and is_so(found):
             return found
         await asyncio.sleep(0.1)
     raise AssertionError(f"{address}: {found}")
