@@ -27,8 +27,6 @@ LIST_REQUESTS_MAX: Final = 12
 LIST_REQUESTS_ALONE: Final = 3
 """The first of them; reads of the index 1 or 0 take turns with the others, for firmware without a list. None
 is alone where reads by index were answered, and reads by name were not."""
-EARLY_TIME: Final = 2.0
-"""Seconds in which an ArduPilot that answers other requests gets no such read: it may just have started."""
 LIST_TIMEOUT_MIN: Final = 0.2
 """Seconds to wait for the first value of a list, at least: a second request makes the list begin again."""
 PAUSE_PX4: Final = 0.12
@@ -140,14 +138,12 @@ class _Download:
     async def begin(self) -> None:
         """Request the list until its first value arrives; later a value too, where no list is served."""
         channel, dialect, target = self.channel, self.session.dialect, self.channel.reads_from
-        may_be_early = self.session.identification.is_ardupilot and channel.answered.is_set()
         self._began = anyio.current_time()
 
         def request(attempt: int) -> Message:
             self.session.report(0, self.table.count)
             self._begins_at = anyio.current_time() if attempt else -math.inf
-            is_early = may_be_early and anyio.current_time() - self._began < EARLY_TIME
-            if attempt < LIST_REQUESTS_ALONE or is_early or attempt % 2 == 0:
+            if attempt < LIST_REQUESTS_ALONE or attempt % 2 == 0:
                 if self.session.only_by_index:
                     self._reading.add(1)
                     self.channel.send(dialect.request_read(target, 1))
