@@ -59,9 +59,12 @@ async def read(session: Session, which: str | int) -> ReportedValue:
             return await _read(session, spelled, which)
     known = session.table.params.get(which) if isinstance(which, str) else None
     if known is not None and known.index is not None and _reads_by_index(session):
-        with suppress(UnknownParameter, NoReply):  # some answer reads by name only
+        try:
             if (answer := await _read(session, known.index)).param_id == which:
                 return answer
+        except (UnknownParameter, NoReply) as error:
+            if isinstance(error, NoReply) and session.serves_reads.get(int):
+                raise  # others answer reads by name only
     return await _read(session, which)
 
 

@@ -42,7 +42,7 @@ ACKS_MAX: Final = 4
 """Acknowledgements of one set: some firmware sends the old value first, and PX4 the new one twice; a link may
 double each."""
 SETS_MIN: Final = 5
-SETS_MAX: Final = 10
+SETS_MAX: Final = 9
 """Sets after which the value counts as kept, and more on a lossy link, beside two that await a read."""
 SETS_TIME: Final = 5.0
 """Seconds after which two sets are sent at once; after twice as many, the fewest suffice."""
