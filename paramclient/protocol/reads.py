@@ -62,9 +62,9 @@ async def read(session: Session, which: str | int) -> ReportedValue:
         try:
             if (answer := await _read(session, known.index)).param_id == which:
                 return answer
-        except (UnknownParameter, NoReply) as error:
+        except (UnknownParameter, NoReply) as error:  # some answer reads by name only
             if isinstance(error, NoReply) and session.serves_reads.get(int):
-                raise  # others answer reads by name only
+                raise
     return await _read(session, which)
 
 

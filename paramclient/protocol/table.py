@@ -202,10 +202,8 @@ class Table:
         self._put(name, old, new)
         if is_exact and not (old and self.is_reported(old, raw, number)):  # else it may be the old one
             self._exact.add(name)
-        elif (
-            not is_exact and index >= PARAMETERS_MAX
-        ):  # somebody has set it, perhaps to another value of the same float32
-            self._exact.discard(name)
+        elif not is_exact and index >= PARAMETERS_MAX:
+            self._exact.discard(name)  # somebody has set it, perhaps to another value of the same float32
 
     def _take_count(self, name: str, count: int, index: int) -> int | None:
         """Take the count of a value, unless it is false. Return the index; None for a value without one."""
@@ -298,8 +296,10 @@ class Table:
         return is_stored
 
     def complete(self, since: float = math.inf) -> None:
-        """Drop the parameters that a complete list no longer has. Of those with one index all stay that came
-        since then."""
+        """Drop the parameters that a complete list no longer has.
+
+        Where several have one index, all stay that came since then.
+        """
         if not self.is_complete:
             return
         self.was_complete = True

@@ -43,7 +43,7 @@ ACKS_MAX: Final = 4
 double each."""
 SETS_MIN: Final = 5
 SETS_MAX: Final = 9
-"""Sets after which the value counts as kept, and more on a lossy link, beside two that await a read."""
+"""Sets after which the value counts as kept, by the link's loss; up to three more await the next read."""
 SETS_TIME: Final = 5.0
 """Seconds after which two sets are sent at once; after twice as many, the fewest suffice."""
 SETS_LOST: Final = 1e-4
