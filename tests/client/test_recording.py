@@ -172,7 +172,8 @@ async def test_no_key_and_no_signature_is_in_the_log(tmp_path: Path) -> None:
     assert any(isinstance(message, messages.SetupSigning) for _, _, message in vehicle.received)
     written = records(path.read_bytes())
     assert {each.data[2] for each in written} == {0}, "no frame says that it is signed"
-    assert [len(frames.Framer(stream=False).receive(each.data)) for each in written] == [1] * len(written)
+    framer = frames.Framer(stream=False)
+    assert [len(framer.receive(each.data)) for each in written] == [1] * len(written)
     assert not any(isinstance(each, messages.SetupSigning) for each in recorded(path))
     assert any(isinstance(each, messages.ParamValue) for each in recorded(path))
     assert bytes(range(1, 33)) not in path.read_bytes()

@@ -270,7 +270,8 @@ def test_a_recording_gives_the_frames_that_pymavlink_finds(name: str) -> None:
     stream = b"".join(parts)
     expected = read_by_pymavlink(stream)
     assert Framer().receive(stream) == expected
-    assert [frame for part in parts for frame in Framer(stream=False).receive(part)] == expected
+    datagrams = Framer(stream=False)
+    assert [frame for part in parts for frame in datagrams.receive(part)] == expected
     values = [decode(frame) for frame in Framer({22}).receive(stream)]
     theirs = [m for m in dialect.MAVLink(None).parse_buffer(stream) if m.get_type() == "PARAM_VALUE"]
     for ours, message in zip(values, theirs, strict=True):
