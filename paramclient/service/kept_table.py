@@ -147,10 +147,10 @@ def listed(session: Session) -> list[ReportedValue]:
 
 def whole_list(session: Session) -> list[ReportedValue]:
     """Return the answers to a request for the list of a table in sync; empty if it is not complete."""
-    values, digest = listed(session), digest_of(session)
-    if not session.table.is_complete or len(values) < len(session.table.names):
+    values = listed(session) if session.table.is_complete else []
+    if not values or len(values) < len(session.table.names):
         return []
-    return values if digest is None else [digest, *values]
+    return values if (digest := digest_of(session)) is None else [digest, *values]
 
 
 def known_param(session: Session, name: str | None) -> Param | None:
