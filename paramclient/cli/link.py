@@ -57,9 +57,9 @@ async def link(
         listen_only: Send nothing. The round trip is then not measured.
     """
     is_live = sys.stdout.isatty() and not options.json
-    deadline = Deadline(seconds, None if is_live else LINK_LISTENING_TIME)
     opened, found = open_client(url, options, cache=False, traffic=True, listen_only=listen_only), None
     async with opened as client, task_group() as tasks:
+        deadline = Deadline(seconds, None if is_live else LINK_LISTENING_TIME)  # opening takes its own time
         tasks.start_soon(_measure_round_trips, client)
         try:
             while left := deadline.left(REFRESH_INTERVAL):
@@ -78,7 +78,7 @@ async def link(
         tasks.cancel_scope.cancel()
         if not (found and found["frames"]):
             what, hint = f"a MAVLink frame on {client.link.name}", received_in_words(client)
-            raise NoReply(what, attempts=0, waited=report.seconds, hint=hint)
+            raise NoReply(what, attempts=0, waited=client.traffic_report().seconds, hint=hint)
 
 
 async def _measure_round_trips(client: ParamClient) -> None:

@@ -153,12 +153,12 @@ print(json.dumps(found))
 def test_the_command_writes_logs_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "flight.tlog"
     assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache", "--tlog", str(path)]) == 0
-    names = [each.param_id for each in recorded(path) if isinstance(each, messages.ParamValue)]
-    assert names == ["MC_ROLL_P"]
+    assert [one.param_id for one in recorded(path) if isinstance(one, messages.ParamValue)] == ["MC_ROLL_P"]
     assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache", "--tlog", str(path)]) == 2
     assert "flight.tlog exists" in capsys.readouterr().err
-    assert run(["link", "sim:px4", "--seconds", "0.1", "--tlog", str(tmp_path / "link.tlog")]) == 0
+    assert run(["link", "sim:px4", "--seconds", "0.5", "--tlog", str(tmp_path / "link.tlog")]) == 0
     assert recorded(tmp_path / "link.tlog")
+    assert run(["link", "sim:px4", "--seconds", "1e-9"]) == 3, "nothing was heard in that time"
 
 
 async def test_no_key_and_no_signature_is_in_the_log(tmp_path: Path) -> None:
