@@ -80,8 +80,8 @@ async def apply(
     file. Exit code 1: some values differ; 2: the file has a fault. After an interruption, run the same
     command again to continue. If several vehicles are heard, --vehicle must choose one, or all.
 
-    Left out are actions, and by default the categories identity, hardware, calibration, measured, counter,
-    read-only and out-of-range.
+    Left out are overlong names, actions, and by default the categories identity, hardware, calibration,
+    measured, counter, read-only and out-of-range.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, or sim:ardupilot for a simulated vehicle.
@@ -180,7 +180,7 @@ async def _from_file(
         file = source or (read_source(path) if is_file(path) else None)
         if file is None:
             raise errors.FileError("no such file", source=path)
-        if file.left_out and not partial:
+        if file.faults and not partial:
             raise errors.FileError("nothing was sent; --partial writes what can be read", source=file.source)
         params = choose(file, session.choice.component, session.component.system)
         own, origin = session.component.identity, params.identity
@@ -189,7 +189,7 @@ async def _from_file(
         is_named = own.uid and any(own.uid in each for each in (params.source, *header))
         if own.uid and not has_uid and (session.choice.uid or is_named):
             params = replace(params, identity=replace(origin or own, uid=own.uid))
-        return State(params, is_restore, partial, ExitCode.USAGE if file.left_out else ExitCode.DONE)
+        return State(params, is_restore, partial, ExitCode.USAGE if file.faults else ExitCode.DONE)
 
     return replace(options, extended=options.extended or (source is not None and source.is_extended)), load
 

@@ -64,7 +64,8 @@ class ParamFile:
         header: the comment lines at the top, without comment characters.
         footer: the comment lines after the last parameter. All others belong to the parameter below them.
         notes: remarks for the user, in sentences: repeated lines, parts left out.
-        left_out: number of faults for which parameters were left out, see `partial` of `read_file`.
+        faults: number of faults for which parameters were left out, see `partial` of `read_file`. A name that
+            is too long for any vehicle is none: real files of ArduPilot have such names.
     """
 
     sets: tuple[ParamSet, ...]
@@ -73,7 +74,7 @@ class ParamFile:
     header: tuple[str, ...] = ()
     footer: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    left_out: int = 0
+    faults: int = 0
 
     @property
     def is_extended(self) -> bool:

@@ -35,7 +35,7 @@ from paramclient.files.reading import (
     value_text,
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, check_portable_name, is_portable_name
+from paramclient.model.values import NAME_LENGTH, ParamType, Value, check_portable_name, is_portable_name
 
 FILES_MAX: Final = 64
 """Files that one file may include in total, nested or not. Two lines in each of a few files could include
@@ -113,7 +113,7 @@ class _Pairs:
             words.pop()
         value = self._number(line, words, source)
         expected = f"{self._expected} with a parameter's name"
-        if value is None or not self._reading.has_name(line, words[0], expected, source):
+        if value is None or not _has_name(self._reading, line, words[0], expected, source):
             return
         number = None if chain else line.number
         place = f"{source}:{line.number}" if chain else f"line {line.number}"
@@ -198,7 +198,7 @@ def read_qgc(reading: Reading, file_format: FileFormat) -> ParamFile:
         except UsageError as error:
             reading.bad_line(line, str(error))
             return
-        if reading.has_name(line, columns[2], "a parameter's name in the third column"):
+        if _has_name(reading, line, columns[2], "a parameter's name in the third column"):
             param = WrittenParam(columns[2], value, kind, comment=comment, line=line.number)
             reading.add(param, f"line {line.number}", system, component)
 
@@ -271,6 +271,17 @@ def write_list(
             yield from comment_lines([param.comment])
         yield line_of(params, param)
     yield from comment_lines(around.footer)
+
+
+def _has_name(reading: Reading, line: TextLine, name: str, expected: str, source: str = "") -> bool:
+    """Return whether a vehicle can have the name in a line; else add the line."""
+    try:
+        check_portable_name(name)
+    except UsageError as error:
+        reading.bad_line(line, f"{expected} ({error})", source)
+        reading.overlong_count += len(name) > NAME_LENGTH
+        return False
+    return True
 
 
 def _read_commented_lines(text: str, reading: Reading, take: Callable[[TextLine, str], None]) -> Comments:

@@ -16,7 +16,7 @@ from paramclient.files.formats import FileFormat, ParamFile, address
 from paramclient.model.names import counted, first_of
 from paramclient.model.notation import value_written
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, bits_of, check_portable_name, format_value, from_bits
+from paramclient.model.values import ParamType, Value, bits_of, format_value, from_bits
 
 FAULTS_MAX: Final = 20
 """Bad lines that an error lists: in a file of another kind, every line is bad."""
@@ -63,6 +63,7 @@ class Reading:
         self.is_on_disk = is_on_disk
         self.partial = partial
         self.fault_count = 0
+        self.overlong_count = 0  # of these, for names that are too long for any vehicle
         self.notes: list[str] = []
         self._faults: list[tuple[str, int | None, str]] = []
         self._is_damaged = False  # by a fault that is not of one parameter
@@ -98,15 +99,6 @@ class Reading:
             self._faults.append((source or self.source, line, what))
         self.fault_count += 1
         self._is_damaged |= not is_row
-
-    def has_name(self, line: TextLine, name: str, expected: str, source: str = "") -> bool:
-        """Return whether a vehicle can have the name in a line; else add the line."""
-        try:
-            check_portable_name(name)
-        except UsageError as error:
-            self.bad_line(line, f"{expected} ({error})", source)
-            return False
-        return True
 
     def bad_line(self, line: TextLine, expected: str, source: str = "", *, is_row: bool = True) -> None:
         """Add a line that has other content than expected."""
@@ -173,7 +165,8 @@ class Reading:
         if self.foreign:
             places = first_of(self.foreign, FAULTS_MAX)
             self.notes.append(f"Comments that are not UTF-8 were read as Windows-1252: {places}.")
-        return ParamFile(sets, file_format, self.source, header, footer, tuple(self.notes), self.fault_count)
+        count = self.fault_count - self.overlong_count
+        return ParamFile(sets, file_format, self.source, header, footer, tuple(self.notes), count)
 
 
 def lacks_begin(params: ParamSet, sets: Sequence[ParamSet]) -> str:
@@ -230,10 +223,7 @@ def decode_text(data: bytes, source: str) -> str:
 
 def lines_of(text: str) -> Iterator[TextLine]:
     """Generate all lines, empty ones included, with their comments."""
-    start = 0
-    for number, end in enumerate((*_line_end.finditer(text), None), start=1):
-        line = text[start:] if end is None else text[start : end.start()]
-        start = 0 if end is None else end.end()
+    for number, line in enumerate(_line_end.split(text), start=1):
         found = _comment_start.search(line)
         if found is None:
             yield TextLine(number, line.strip(" \t"), None)

@@ -85,7 +85,7 @@ def test_apply_sets_and_verifies_values_that_differ(command: Command, put: Put, 
 
 
 IMPOSSIBLE = {
-    "quad.param": "RTL_ALT,2500\nSIM_GPS1_BYTELOSS,0\n",
+    "quad.param": "RTL_ALT,2500\nSIM GPS,0\n",
     "{system}.param": "RTL_ALT,2500\nWPNAV_SPEED,fast\n",
     "quad.params": "1\t1\tRTL_ALT\t2500\t6\n1\t1\tWPNAV_SPEED\t1e39\t9\n",
 }
@@ -100,6 +100,11 @@ def test_an_impossible_line_is_skipped_by_partial(command: Command, put: Put, fi
         assert "line 2: " in outcome.err
     with pytest.raises(FileError, match=":2: expected "):  # a program writes all of a file, or nothing
         anyio.run(resolve, str(wrong))
+
+
+def test_a_name_that_is_too_long_for_any_vehicle_is_skipped(command: Command, put: Put, file: File) -> None:
+    outcome = command("apply", put(vehicle := copter()), file("RTL_ALT,2500\nSIM_GPS1_BYTELOSS,0\n"))
+    assert (outcome.code, vehicle.values["RTL_ALT"], "line 2: " in outcome.err) == (0, 2500, True)
 
 
 @pytest.mark.parametrize(

@@ -45,8 +45,7 @@ def test_set_accepts_value_names_of_the_vehicle(command: Command, put: Put) -> N
     words = ("COM_FLTMODE1=return", "EKF2_GPS_CTRL=Position|Heading", "--json", "--no-cache")
     done = command("set", put(vehicle), *words)
     assert (done.code, done.err) == (0, "")
-    assert vehicle.values["COM_FLTMODE1"] == 5
-    assert vehicle.values["EKF2_GPS_CTRL"] == 9
+    assert [vehicle.values[name] for name in ("COM_FLTMODE1", "EKF2_GPS_CTRL")] == [5, 9]
     assert [each["text"] for each in done.json["results"]] == ["Return", "Position|Heading"]
 
 

@@ -52,9 +52,8 @@ def test_the_most_exact_version_that_fits_is_used(tmp_path: Path) -> None:
     assert maximum(files, replace(COPTER, firmware=0x040600FF)) == 460
     assert maximum(files, replace(COPTER, firmware=0x043C0000)) == 1, "4.60 is not 4.6"
     assert maximum(files, replace(COPTER, firmware=0)) == 1, "the version is not known"
-    assert maximum(files, replace(COPTER, vehicle_type=13)) == 46, "a hexacopter"
-    assert maximum(files, replace(COPTER, vehicle_type=1)) == 3
-    assert maximum(files, replace(COPTER, vehicle_type=10)) is None
+    kinds = [replace(COPTER, vehicle_type=each) for each in (13, 1, 10)]
+    assert [maximum(files, each) for each in kinds] == [46, 3, None], "a hexacopter, a plane, a rover"
     assert maximum(files, replace(COPTER, autopilot=PX4)) is None
     assert maximum(files, COPTER, component=100) is None, "a camera"
 
