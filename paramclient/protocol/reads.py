@@ -63,7 +63,7 @@ async def read(session: Session, which: str | int) -> ReportedValue:
             if (answer := await _read(session, known.index)).param_id == which:
                 return answer
         except (UnknownParameter, NoReply) as error:  # some answer reads by name only
-            if isinstance(error, NoReply) and session.serves_reads.get(int):
+            if isinstance(error, NoReply) and (session.serves_reads.get(int) or session.channel.is_lost):
                 raise
     return await _read(session, which)
 
@@ -256,8 +256,10 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
         while None in session.reading:  # noqa: ASYNC110 - the values of a list would be taken for the answers
             await anyio.sleep(session.channel.timing.timeout(0))
         control = await _try(session, likely) or await _try(session, 0)  # the indices may be 0, 2, 4, …
-        is_proven = not isinstance(which, str) or session.serves_reads.get(str)
-        if control is None or is_proven or control.param_id == which:
+        if control is None or not isinstance(which, str) or session.serves_reads.get(str):
+            return control
+        if control.param_id == which:
+            session.serves_reads.setdefault(str, False)
             return control
         if str not in session.serves_reads:
             await anyio.sleep(1.25 * session.channel.timing.slowest)  # for its other answers
@@ -311,7 +313,7 @@ async def _read_list(session: Session, inbox: Inbox, which: str | int) -> Report
                 has_gap = listed.has_gap or (bool(listed.missing) and which in session.table.params)
         tasks.cancel_scope.cancel()
     if answers or has_gap is not None:
-        session.serves_reads.setdefault(type(which), False)
+        session.serves_reads = {str: False, int: False} | session.serves_reads
     if answers:
         return answers[0]
     if session.channel.is_lost or has_gap is not False:

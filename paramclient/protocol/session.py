@@ -223,7 +223,7 @@ class Session:
         _, raw, number, _, _ = message
         table, replaced, is_sent = self.table, self.replaced.get(name), self.sent.get(name) == raw
         known, may_read = table.params.get(name), not self.identification.listens_only
-        if known and known.type != number and known.trust is not Trust.CACHED and self.acknowledging[name]:
+        if known and known.type != number and self.acknowledging[name]:
             self.acknowledging[name] -= 1
             return None
         is_other = known is not None and not table.is_reported(known, raw, number)

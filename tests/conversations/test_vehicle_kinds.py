@@ -12,7 +12,7 @@ import pytest
 
 from paramclient import Encoding, ParamClient, ParamType, errors
 from paramclient.model.values import encode_value
-from paramclient.protocol.fetch import fetch_all
+from paramclient.protocol.fetch import Policy, fetch_all
 from paramclient.protocol.reads import read
 from paramclient.protocol.set_results import SetStatus
 from paramclient.protocol.writes import write, write_many
@@ -62,13 +62,19 @@ async def test_any_part_suffices_to_read_and_to_prove_a_set(
                 await read(session, "OFFSETS")
 
 
+PARTS_WITHOUT_SETS = ["list", "list+names", "list+acks", "list+indices", "indices", "names", "names+acks"]
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.15, 0.3])
-@pytest.mark.parametrize(
-    "parts", ["list", "list+names", "list+acks", "list+indices", "indices", "names", "names+acks"]
-)
-async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(parts: str, delay: float) -> None:
+@pytest.mark.parametrize("is_fetched", [False, True])
+@pytest.mark.parametrize("parts", [*PARTS_WITHOUT_SETS, "list+indices+acks", "indices+acks"])
+async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(
+    parts: str, delay: float, is_fetched: bool
+) -> None:
     vehicle = Partial(serves=parts.split("+"))
     async with talking(Air.symmetric([vehicle], delay=delay)) as (_, session):
+        with suppress(errors.NoReply):
+            await fetch_all(session, policy=Policy.AUTO if is_fetched else Policy.CACHE_ONLY)
         with pytest.raises(errors.ValueNotApplied, match="1/1 keeps MODE at 5") as caught:
             with anyio.fail_after(15.0):
                 await write(session, "MODE", 4)
@@ -86,13 +92,17 @@ async def test_sets_that_a_burst_of_losses_takes_are_not_told_as_kept(seed: int)
 
 async def test_an_acknowledgement_in_another_type_changes_neither_the_type_nor_the_history() -> None:
     for kind in (ParamType.REAL32, ParamType.UINT32, ParamType.INT8):
-        async with talking(Partial(ack_type=kind)) as (conversation, session):
+        air = Air.symmetric([Partial(ack_type=kind)], delay=0.3)
+        async with talking(air) as (conversation, session):
             await fetch_all(session)
             conversation.changes.clear()
+            with anyio.move_on_after(0.2):  # its acknowledgement comes later
+                await write(session, "MODE", 9)
+            await anyio.sleep(1.0)
             result = await write(session, "MODE", 4)
             assert (result.status, result.actual, result.param.type) == ("accepted", 4, ParamType.INT32)
             changes = [(each.name, each.new and each.new.value) for each in conversation.changes]
-            assert changes == [("MODE", 4)]
+            assert changes == [("MODE", 9), ("MODE", 4)]
 
 
 async def test_an_integer_is_not_written_in_the_type_of_a_repeated_acknowledgement() -> None:
