@@ -251,7 +251,7 @@ def test_the_commands_for_users_of_other_programs_run(tmp_path: Path) -> None:
         assert run_command(f"paramclient fetch {link} --tlog flight.tlog", folder).returncode == 0
         assert run_command(f"paramclient save {link} other.parm", folder).returncode == 0
         for command in re.findall(r"^\|[^|\n]*\| `(paramclient [^`|]*)`", section, re.MULTILINE):
-            words = command.replace("LINK", link) + " --timeout 1" * (" watch " in command)
+            words = command.replace("LINK", link) + " --timeout 3" * (" watch " in command)
             done = run_command(words, folder)
             assert done.returncode == 0, command + done.stderr
 
