@@ -18,7 +18,7 @@ import anyio.to_thread
 from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
 from paramclient.model.identity import Identity
-from paramclient.model.values import Param
+from paramclient.model.values import Param, ParamType
 from paramclient.protocol.node import Node
 from paramclient.protocol.selection import vehicle_of
 from paramclient.protocol.session import Session
@@ -203,8 +203,9 @@ class CacheWriter:
         """Take a change of a parameter."""
         if self.cache is None:
             return
-        record = self._record(node, session)
-        if len(record.changes) < PENDING_MAX and not session.encoding_doubt:
+        record, param = self._record(node, session), change.new or change.old
+        is_certain = not session.encoding_doubt or (param and param.type is ParamType.REAL32)
+        if len(record.changes) < PENDING_MAX and is_certain:
             at = min(session.table.moments.get(change.name, math.inf), anyio.current_time())
             record.changes.append((change, at))
         else:
@@ -224,8 +225,7 @@ class CacheWriter:
         What was received of an unidentified component before it was lost may be of another vehicle.
         """
         record = self._records.get(session)
-        is_doubtful = record is not None and record.generation != node.generation
-        if record is None or (is_doubtful and node not in self._identities):
+        if record is None or (record.generation != node.generation and node not in self._identities):
             record = self._records[session] = TableRecord(node.generation)
         return record
 
@@ -283,17 +283,17 @@ class CacheWriter:
                     record.is_whole = True
                 self._something_to_write.set()
 
-    async def write_durably(self, node: Node) -> None:
+    async def write_durably(self, node: Node, session: Session) -> None:
         """Write all received values, safe from power loss.
 
         Raises:
             UsageError, CacheError: as from `check_kept` and `write_all`.
         """
-        self.check_kept(node)
+        self.check_kept(node, session)
         await self.write_all(durable=True)
 
-    def check_kept(self, node: Node) -> None:
-        """Check that the values of a component are written.
+    def check_kept(self, node: Node, session: Session) -> None:
+        """Check that the values of a component's table are written.
 
         Raises:
             UsageError: there is no cache.
@@ -301,9 +301,9 @@ class CacheWriter:
         """
         if self.cache is None:
             raise UsageError("durable needs a cache, and the client has none; open it with a cache")
-        if node.plain.encoding_doubt or node not in self._identities or not self._is_certain(node):
-            unknown = f"it is not known which vehicle {node.system}/{node.component} is"
-            raise CacheError(node.plain.encoding_doubt or unknown)
+        doubt = session.encoding_doubt
+        if doubt or node not in self._identities or not self._is_certain(node):
+            raise CacheError(doubt or f"it is not known which vehicle {node.system}/{node.component} is")
 
     def _is_certain(self, node: Node) -> bool:
         """Return whether the vehicle and the component are still those that were identified."""

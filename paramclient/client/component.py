@@ -641,12 +641,12 @@ class Component:
         if durable:
             with anyio.move_on_after(0.0 if self.core.cache is None else CACHE_TIMEOUT):
                 await self.cache_is_read.wait()
-            self.core.cache_writer.check_kept(self.node)
+            self.core.cache_writer.check_kept(self.node, self.session)
         return checked
 
     async def _write_durably(self, what: str) -> None:
         try:
-            await self.core.cache_writer.write_durably(self.node)
+            await self.core.cache_writer.write_durably(self.node, self.session)
         except CacheError as error:
             where = self.node.channel
             raise NotDurable(f"{where} has accepted {what}, but it is not on the disk: {error}") from error

@@ -284,7 +284,7 @@ class _Run:
             else:
                 break
         if self.options.get("durable") and self.sent:
-            await self.component.core.cache_writer.write_durably(self.component.node)
+            await self.component.core.cache_writer.write_durably(self.component.node, self.component.session)
         if self._end_operation is not None:
             await self.component.core.cache_writer.attempt(self._end_operation)
 

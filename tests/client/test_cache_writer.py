@@ -247,7 +247,9 @@ async def test_no_value_of_a_wrong_encoding_is_kept_where_the_heartbeat_comes_la
     async with shell.a_client(shell.Tap(vehicle, down=late), cache=path) as client:
         component = await client.component(1, 1)
         assert (await component.fetch_all()).params["MODE"].value == 1084227584
+        await component.set("GAIN_1", 7.5)  # which is the same in both
         await asyncio.sleep(8.0)
+    assert history(path) == [("GAIN_1", 0.5, 7.5, "us")]
     assert "MODE" not in table_in(path, "1").params
 
 
