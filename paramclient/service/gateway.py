@@ -125,13 +125,13 @@ class Gateway:
         if bears_key(seen.data) or (table is None and self.copies.is_copy(seen.data, (link, peer))):
             return
         for station in self.stations:
-            served = table if table is not None and self._serves(station, table, link) else None
-            station.relay(seen, is_withheld=served is not None)
+            is_served = table is not None and self._serves(station, table, link)
+            station.relay(seen, is_withheld=is_served)
             at, address, extended, taken = station.list_asked  # before the vehicle was heard
-            is_new = served is not None and anyio.current_time() - at < TAKE_OVER_TIME and served not in taken
-            if is_new and served is not None and served in link.tables(*address, extended=extended):
-                taken.add(served)
-                served.send_list(station)
+            is_new = is_served and anyio.current_time() - at < TAKE_OVER_TIME and table not in taken
+            if table is not None and is_new and table in link.tables(*address, extended=extended):
+                taken.add(table)
+                table.send_list(station)
 
     def announce(self, link: VehicleLink, table: KeptTable, message: Message) -> None:
         """Send a value that has changed to all stations."""

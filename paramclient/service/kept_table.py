@@ -277,7 +277,7 @@ class KeptTable(Stream[Change]):
         if values := self.list_if_current or (listed(self.session) if is_partial else []):
             self._stream(station, values, set())
         else:
-            self._listing.setdefault(station, set())
+            self._listing[station] = set()
             self.load()
 
     def _stream(self, station: GroundStation, values: Iterable[ReportedValue], sent: set[int]) -> None:
