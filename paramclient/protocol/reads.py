@@ -101,6 +101,7 @@ async def _read(session: Session, which: str | int, alias: str | int | None = No
                             raise
                         return listed
                 if control.param_id in (which, alias):
+                    session.serves_reads.setdefault(type(which), False)  # by its index only
                     return control
                 with suppress(NoReply):  # it answers by now, and may only have been busy
                     return await _ask(session, inbox, which, channel.timing.attempts_for(CONTROL_LOST))
@@ -256,10 +257,8 @@ async def _control_read(session: Session, which: str | int) -> ReportedValue | N
         while None in session.reading:  # noqa: ASYNC110 - the values of a list would be taken for the answers
             await anyio.sleep(session.channel.timing.timeout(0))
         control = await _try(session, likely) or await _try(session, 0)  # the indices may be 0, 2, 4, …
-        if control is None or not isinstance(which, str) or session.serves_reads.get(str):
-            return control
-        if control.param_id == which:
-            session.serves_reads.setdefault(str, False)
+        is_proven = not isinstance(which, str) or session.serves_reads.get(str)
+        if control is None or is_proven or control.param_id == which:
             return control
         if str not in session.serves_reads:
             await anyio.sleep(1.25 * session.channel.timing.slowest)  # for its other answers
