@@ -214,10 +214,10 @@ class Session:
             sequence: of its frame: a lower one than that of the known value was overtaken.
         """
         name, spelled = message.param_id, self.spelled(message.param_id)
-        if name != spelled and self.identification.is_ardupilot:
+        if name != spelled and self.identification.is_ardupilot and message.param_index == NO_INDEX:
             if spelled in self.table.params:
                 name, message = spelled, message._replace(param_id=spelled)
-            elif message.param_index == NO_INDEX and (self.dialect.value, name) not in self.channel.inboxes:
+            elif (self.dialect.value, name) not in self.channel.inboxes:
                 return None  # in the case of another station's request: the vehicle may have it in capitals
         message = self.typed(message)
         _, raw, number, _, _ = message
@@ -227,7 +227,7 @@ class Session:
             self.acknowledging[name] -= 1
             return None
         is_other = known is not None and not table.is_reported(known, raw, number)
-        is_answer = message.param_index != NO_INDEX or (name in self.reading and not is_sent)
+        is_answer = not is_sent and (message.param_index != NO_INDEX or name in self.reading)
         until = table.moments.get(name, -math.inf) + LATE_TIME
         behind = (self._sequences.get(name, sequence) - sequence) % 256
         is_overtaken = may_read and 0 < behind < 128 and now <= until

@@ -252,7 +252,6 @@ class _Write:
         self.name = self.before.name
         self._encode()
         self._confirm = partial(self.session.confirm, self.vehicles)
-        self._has_other_value = False
         self._has_new_type = False
 
     async def run(self) -> SetResult:
@@ -320,7 +319,8 @@ class _Write:
             why = f"{channel} refused {self.name}: {ExtAckResult.name_of(answer.param_result)}"
             refused = kind(why, *channel.target, code=answer.param_result, name=self.name)
         elif isinstance(answer, Param) and answer.type == self.before.type:
-            del self.session.acknowledging[self.name]  # it acknowledges in this type
+            if self.session.acknowledging[self.name] % ACKS_MAX == 0:  # none came in another type
+                del self.session.acknowledging[self.name]
             return answer
         if not channel.is_silent(self.began):
             with suppress(NoReply):  # only a read shows a changed type, or an extended parameter's value
@@ -390,9 +390,8 @@ class _Write:
 
     def _is_converted(self, param: Param) -> bool:
         """Return whether the value is the wanted one as an ArduPilot converts it: 3000 of 3000.5."""
-        is_integer = isinstance(param.type, ParamType) and param.type.is_integer
         is_finite = isinstance(self.value, float) and math.isfinite(self.value)
-        return is_integer and is_finite and param.value == int(self.value)
+        return param.type.is_integer and is_finite and param.value == int(self.value)
 
     def _result(self, param: Param) -> SetResult:
         actual = self.session.table.params.get(self.name, param)
@@ -452,7 +451,7 @@ async def _read_writable(session: Session, name: str) -> Param:
     if session.channel.is_lost:
         raise NoReply(f"the encoding of {session.channel}", attempts=0, waited=anyio.current_time() - began)
     param = await _known(session, name)
-    if isinstance(param.type, ParamType) and param.type.is_integer and session.identification.chosen is None:
+    if param.type.is_integer and session.identification.chosen is None:
         # 0 is the same in both, and files have no encoding; a whole list has shown all that there is.
         is_seen = not session.serves_file and all(each.trust is Trust.LIVE for each in table.params.values())
         if not (table.evidence or (table.is_complete and is_seen)):
@@ -469,20 +468,25 @@ async def _known(session: Session, name: str) -> Param:
 
 
 async def _seek_evidence(session: Session) -> None:
-    """Read the first values of the list, until one shows the encoding or all had time to be answered.
+    """Read integers other than 0 that a file has shown, and the first values of the list, until one shows the
+    encoding or all had time to be answered.
 
     Where none of these does, or no reads by index are answered, the whole list may show it.
     """
     channel, table, began = session.channel, session.table, anyio.current_time()
+    known = [each for each in table.params.values() if each.type.is_integer and each.value]
     if session.serves_reads.get(int) is not False:
+        ways = [way for each in known for way in (each.name, each.index) if way is not None][:EVIDENCE_READS]
+        ways += range(min(EVIDENCE_MAX, table.count or EVIDENCE_MAX))
         with channel.inbox(session.dialect.value) as inbox:
-            for first in range(0, min(EVIDENCE_MAX, table.count or EVIDENCE_MAX), EVIDENCE_READS):
+            for first in range(0, len(ways), EVIDENCE_READS):
                 sent, seconds = anyio.current_time(), queue_time(session, EVIDENCE_READS)
-                for index in range(first, first + EVIDENCE_READS):
-                    channel.send(session.dialect.request_read(channel.reads_from, index))
+                for which in ways[first : first + EVIDENCE_READS]:
+                    channel.send(session.dialect.request_read(channel.reads_from, which))
                 if await channel.wait_for(inbox, lambda message: table.evidence or None, sent, 0, seconds):
                     return
-        if session.serves_file or (table.is_complete and min(table.moments.values(), default=began) >= began):
+        is_seen = table.is_complete and min(table.moments.values(), default=began) >= began
+        if is_seen or (session.serves_file and not known):
             return
     with suppress(NoReply), anyio.move_on_after(2 * SETS_TIME):  # it has no list either
         await session.listing.join(lambda: download_list(session))

@@ -14,7 +14,7 @@ from paramclient.protocol.fetch import fetch_all
 from paramclient.protocol.reads import read, read_many
 from paramclient.protocol.writes import write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
-from paramclient.wire.messages import Message, ParamError, ParamRequestRead, ParamValue
+from paramclient.wire.messages import NO_INDEX, Message, ParamError, ParamRequestRead, ParamValue
 from tests.conversations.virtual import Puppet, converse, meanwhile, talking, virtual_on_both
 from tests.shell import Tap
 
@@ -128,7 +128,7 @@ async def test_an_ardupilot_takes_names_in_any_case_and_its_table_has_one_of_eac
         result = await write(session, "rtl_alt", 1000)
         assert (result.name, result.actual, result.attempts) == ("RTL_ALT", 1000, 1)
         await anyio.sleep(1.0)
-        conversation.hear(ParamValue("Rtl_Alt", struct.pack("<f", 900.0), ParamType.INT32, 900, 3))
+        conversation.hear(ParamValue("Rtl_Alt", struct.pack("<f", 900.0), ParamType.INT32, 900, NO_INDEX))
         assert [session.table.params[name].value for name in session.table.params] == [900]
 
 
