@@ -499,10 +499,7 @@ class Component:
             LinkError: the link failed, or the client was closed.
         """
         if not link_is_safe:
-            raise UsageError(
-                "SETUP_SIGNING sends the key unencrypted. Use a link that no other party can read, such as"
-                " USB, and pass link_is_safe=True"
-            )
+            raise UsageError("the key is sent unencrypted: use a link like USB, and pass link_is_safe=True")
         if self.node.version == 1:
             raise UsageError(f"{self.system}/{self.component} uses MAVLink 1, which has no signing")
         station, node = self.core.station, self.node
@@ -638,6 +635,9 @@ class Component:
             words = node_in_words(self.node)
             what = f"two vehicles use the ids {words}; nothing was written."
             raise AmbiguousVehicle(what, vehicles=[words], choose_by="peer")
+        others = [each for each in self.core.station.nodes.values() if each.system == self.system]
+        if self.component == 0 and len(others) > 1:
+            raise UsageError(f"component 0 means all {len(others)} of its system; nothing was written")
         if durable:
             with anyio.move_on_after(0.0 if self.core.cache is None else CACHE_TIMEOUT):
                 await self.cache_is_read.wait()
