@@ -228,7 +228,7 @@ class _Check:
             self.findings.append(("problem", f"The list could not be downloaded: {problem}."))
         if doubt := component.session.encoding_doubt:
             self.findings.append(("problem", doubt))
-        if rate and rate < LIST_RATE_SLOW:
+        if rate and rate < LIST_RATE_SLOW and (result is None or result.is_served):
             self.findings.append(("slow", f"The list is received at {rate:.0f} values per second{SLOW_LIST}"))
 
     async def _file(self) -> None:

@@ -128,10 +128,8 @@ class FetchResult:
 
     def __repr__(self) -> str:
         missing = f", {len(self.missing)} missing" if self.missing else ""
-        return (
-            f"<FetchResult {self.system}/{self.component} {self.received} params{missing} "
-            f"from {self.source} in {self.elapsed:.2f} s>"
-        )
+        what = f"{self.received} params{missing} from {self.source} in {self.elapsed:.2f} s"
+        return f"<FetchResult {self.system}/{self.component} {what}>"
 
 
 async def fetch_all(

@@ -76,6 +76,7 @@ class ListResult:
         digest: PX4's, which begins its list; it is of the table at that moment.
         has_gap: whether values are missing that were sent: some of the list were lost, and reads of them
             would not have been answered.
+        is_served: whether values of a list arrived; else they were read one by one.
     """
 
     missing: list[int] = field(default_factory=list)
@@ -83,6 +84,7 @@ class ListResult:
     repeated: int = 0
     digest: Digest | None = None
     has_gap: bool = False
+    is_served: bool = True
 
 
 async def download_list(session: Session) -> ListResult:
@@ -195,10 +197,11 @@ class _Download:
         if not has_loss and not is_silent:
             self.table.end_list()
         self.result.missing = missing = self._missing()
+        self.result.is_served = self._is_served
         if is_silent or not serves_reads:
             first = min(self._received, default=0)
             self.result.has_gap = any(has_loss or first < each < self._reached for each in missing)
-        self.result.lost = len(self._lost & {*self._received, *missing})
+        self.result.lost = len(self._lost & {*self._received, *missing} & {*range(self._reached + 1)})
 
     async def _take_passes(self) -> None:
         """Receive the list until it is over, and once more while that is quicker than to read its gaps."""
@@ -317,7 +320,7 @@ class _Download:
         if self.table.is_growing or not self._is_served:
             is_open = self.table.is_growing and not self._is_served
             gaps |= {0, *range(count, count + (READS_AHEAD if is_open else 1 + (0 not in self._received)))}
-        elif 0 in gaps and self._is_given_up(0):
+        elif 0 in gaps:
             gaps.add(count)
         return sorted(index for index in gaps - self._received if index < PARAMETERS_MAX)
 

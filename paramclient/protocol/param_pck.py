@@ -135,9 +135,8 @@ def encode(
     total = len(rows) if total is None else total
     if not len(rows) <= total <= 0xFFFF:
         raise UsageError(f"{len(rows)} entries of a table of {total}, and the file counts to 65535")
-    return header(len(rows), total, with_defaults=with_defaults) + b"".join(
-        encode_entries(rows, with_defaults=with_defaults, read_size=read_size)
-    )
+    body = b"".join(encode_entries(rows, with_defaults=with_defaults, read_size=read_size))
+    return header(len(rows), total, with_defaults=with_defaults) + body
 
 
 def header(number: int, total: int, *, with_defaults: bool = False) -> bytes:

@@ -248,10 +248,8 @@ class Table:
             return ""
         ((against, (name, raw, number)),) = self.evidence.items()
         looks = "bytes (a denormal float32)" if against is Encoding.BYTEWISE else "a float32"
-        read, meant = (
-            format_value(self.dialect.param(name, raw, number, None, each).settable, number)
-            for each in (self._encoding, against)
-        )
+        params = (self.dialect.param(name, raw, number, None, each) for each in (self._encoding, against))
+        read, meant = (format_value(each.settable, number) for each in params)
         return f"each integer looks like {looks}; {name} = {read} is {meant} with --encoding {against}"
 
     def store_entry(self, entry: PackedParam, index: int, now: float, *, with_defaults: bool) -> None:

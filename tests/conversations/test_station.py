@@ -81,10 +81,8 @@ async def test_vehicles_are_identified(loss: float) -> None:
         ):
             await session.identification.settled()
             assert session.identification.capabilities is not None
-            assert (name == "px4", name == "ardupilot") == (
-                session.identification.is_px4,
-                session.identification.is_ardupilot,
-            )
+            is_which = (session.identification.is_px4, session.identification.is_ardupilot)
+            assert is_which == (name == "px4", name == "ardupilot")
             assert session.identification.identity.link == "sim:test"
             assert conversation.of("identified")
             asked = len(conversation.sent_of(messages.CommandLong))
@@ -130,10 +128,8 @@ async def test_the_heartbeat_of_a_vehicle_that_sends_other_messages_is_requested
             await anyio.sleep(0.1)
             attitude = build_frame(30, bytes(range(28)), system=7, component=1, sequence=number)
             conversation.station.receive(attitude, "peer", anyio.current_time())
-        assert (
-            conversation.sent_of(messages.CommandLong)
-            == [messages.CommandLong(7, 1, messages.MAV_CMD_REQUEST_MESSAGE, 0.0)] * 2
-        )
+        request = messages.CommandLong(7, 1, messages.MAV_CMD_REQUEST_MESSAGE, 0.0)
+        assert conversation.sent_of(messages.CommandLong) == [request] * 2
 
 
 async def test_another_hardware_id_clears_the_table_and_the_first_one_does_not() -> None:

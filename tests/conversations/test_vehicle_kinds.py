@@ -182,7 +182,7 @@ async def test_no_value_is_dropped_that_has_just_come(step: int, changed: Callab
 async def test_a_count_that_is_too_large_costs_seconds_and_no_value(count: int) -> None:
     async with talking(Partial(count=lambda index: count)) as (conversation, session):
         result = await fetch_all(session)
-        assert (set(result.params), result.received) == (set(TABLE), len(TABLE))
+        assert (set(result.params), result.received, result.lost) == (set(TABLE), len(TABLE), 0)
         assert result.count == count
         assert result.missing == tuple(range(len(TABLE), result.count))
         assert anyio.current_time() < 20.0
@@ -245,6 +245,21 @@ async def test_the_first_value_of_a_list_that_is_lost_is_missing_and_no_other() 
     async with talking(vehicle) as (_, session):
         result = await fetch_all(session)
         assert (result.missing, result.received) == ((0,), len(TABLE) - 1)
+
+
+async def test_the_last_value_of_a_list_from_1_that_is_lost_is_read_at_once() -> None:
+    lost = losing(1, lambda message: getattr(message, "param_index", None) == len(TABLE))
+    async with talking(Air.symmetric([Tap(Partial(first=1), down=lost)], delay=0.02)) as (_, session):
+        assert (await fetch_all(session)).complete
+        assert anyio.current_time() < 1.0
+
+
+async def test_listed_names_that_differ_in_case_alone_are_two_parameters() -> None:
+    """On an ArduPilot too, which repeats the case of a request in its answer."""
+    table = {"I_A": (5.0, ParamType.REAL32), "i_a": (9.0, ParamType.REAL32)}
+    async with talking(Partial(table, serves=("list",), heartbeat=ARDUPILOT)) as (_, session):
+        params = (await fetch_all(session)).params
+        assert {name: param.value for name, param in params.items()} == {"I_A": 5.0, "i_a": 9.0}
 
 
 @pytest.mark.parametrize(("delay", "idle"), [(0.05, 0.0), (0.3, 0.0), (0.3, 3.0)])
@@ -355,6 +370,16 @@ async def test_a_component_with_one_parameter_and_no_list_is_fetched() -> None:
         assert (await fetch_all(session)).complete
 
 
+async def test_an_acknowledgement_with_an_index_is_known_where_reads_have_none() -> None:
+    def on_set(message: messages.ParamSet) -> list[messages.Message]:
+        return [messages.ParamValue("MODE", message.raw, ParamType.INT32, 8, 5)]
+
+    vehicle = Partial(serves=("names",), first=messages.NO_INDEX, step=0, on_set=on_set)
+    async with talking(vehicle) as (_, session):
+        await write(session, "MODE", 4)
+        assert session.table.params["MODE"].value == 4
+
+
 @pytest.mark.parametrize(("reads", "delay"), [(["names"], 0.15), (["list", "indices"], 0.0)])
 async def test_late_acknowledgements_in_another_type_are_no_new_type(reads: list[str], delay: float) -> None:
     vehicle = Partial(serves=(*reads, "sets", "commands"))
@@ -463,6 +488,18 @@ async def test_a_list_in_progress_may_still_show_another_encoding(serves: tuple[
     async with talking(Partial(table, serves=("names", "sets"), heartbeat=QUIET)) as (_, session):
         session.serves_reads[int] = False  # nothing shows it, and no list is served
         assert (await write(session, "ZERO", 9)).status == "accepted"
+
+
+class BytewiseArduPilot(ArduPilotVehicle):
+    encoding = Encoding.BYTEWISE
+
+
+async def test_a_file_shows_which_integers_tell_the_encoding() -> None:
+    table = {**{f"F{number}": number / 2 for number in range(50)}, "Z_A": 0, "Z_B": 77}
+    async with talking(BytewiseArduPilot(table=table, live=())) as (_, session):
+        await fetch_all(session)
+        with pytest.raises(errors.UsageError, match=r"was not written.*--encoding bytewise"):
+            await write(session, "Z_A", 9)
 
 
 async def test_a_whole_list_is_requested_once_for_the_encoding() -> None:
@@ -584,6 +621,11 @@ async def test_a_component_with_the_id_0_is_a_component() -> None:
         assert (await (await client.component(1, 0)).fetch_all()).complete
         with pytest.raises((errors.NoReply, errors.AmbiguousVehicle)):
             await client.component(1, 7, timeout=3.0)
+    async with ParamClient(Air([Partial(component=0), Partial(component=191)]), cache=False) as client:
+        component = await client.component(1, 0)
+        await client.component(1, 191)
+        with pytest.raises(errors.UsageError, match="component 0 means all 2 of its system"):
+            await component.set("MODE", 4)
 
 
 @virtual_on_both
