@@ -55,9 +55,8 @@ def test_a_table_is_read_as_it_was_written(cache: ParamCache, open_cache: Open) 
     table = [*params, raw, replace(params[1], name="WITH_DEFAULT", index=6, default=-5)]
     cache.save(update(*(StoredParam.of(each, NOW) for each in table), table=TableState(None, 7)))
     found = open_cache().component(PX4.key)
-    assert {name: (param, param.default) for name, param in found.params.items()} == {
-        each.name: (each, each.default) for each in table
-    }
+    kept = {name: (param, param.default) for name, param in found.params.items()}
+    assert kept == {each.name: (each, each.default) for each in table}
     assert list(found.params) == [*kinds, "WITH_DEFAULT", "RAW"]
     assert (found.size, found.count, found.complete, found.hash) == (8, 7, False, None)
     assert found.heard_at["NAN"] == NOW
@@ -141,10 +140,8 @@ def test_a_whole_table_removes_other_names(cache: ParamCache) -> None:
     cache.save(whole_table(3))
     cache.save(update(stored("PARAM_0", 0, index=0, at=NOW + 2), at=NOW + 2, replace=True))
     assert values(cache) == {"PARAM_0": 0}
-    assert [(line.at, line.name, line.new) for line in cache.history("1")] == [
-        (NOW + 2, "PARAM_1", None),
-        (NOW + 2, "PARAM_2", None),
-    ]
+    lines = [(line.at, line.name, line.new) for line in cache.history("1")]
+    assert lines == [(NOW + 2, "PARAM_1", None), (NOW + 2, "PARAM_2", None)]
 
 
 def test_an_older_table_or_removal_keeps_names_that_were_observed_later(cache: ParamCache) -> None:

@@ -129,10 +129,8 @@ def test_cached_extended_parameters_are_shown_offline(command: Command, put: Put
     assert command("fetch", url).code == 0
     assert command("fetch", url, *CAMERA).code == 0
     shown = command("show", "1/100", "--extended")
-    assert (shown.code, [row[0] for row in shown.rows[1:]]) == (
-        0,
-        ["CAM_MODE", "CAM_NAME", "CAM_KEY", "CAM_EV"],
-    )
+    assert shown.code == 0
+    assert [row[0] for row in shown.rows[1:]] == ["CAM_MODE", "CAM_NAME", "CAM_KEY", "CAM_EV"]
     assert command("show", 1, "CAM_NAME", "--extended").rows[1][:3] == ["CAM_NAME", "Front", "CUSTOM"]
     [table] = command("show", 1, "--extended", "--json").json["components"]
     assert table["params"]["CAM_MODE"]["value"] == 1
@@ -146,9 +144,7 @@ def test_all_are_those_that_have_some(command: Command, put: Put) -> None:
     assert (fetched.code, [each["component"] for each in fetched.json["vehicles"]]) == (0, [100])
     assert fetched.err.startswith("1/1 PX4 quadrotor has no extended parameters, or none in 2.5 s\n")
     alone = command("fetch", put(small()), "--vehicle", "all", "--extended")
-    assert (alone.code, alone.err.startswith("4 extended parameters of 1/100 camera from stream ")) == (
-        0,
-        True,
-    )
+    assert alone.code == 0
+    assert alone.err.startswith("4 extended parameters of 1/100 camera from stream ")
     none = command("fetch", put(PX4Vehicle(table={"A": 1})), "--vehicle", "all", "--extended")
     assert (none.code, "a component with extended parameters" in none.err) == (3, True)

@@ -98,10 +98,8 @@ def test_history_prints_the_cached_changes_since_a_time(command: Command) -> Non
     lines = [(each["component"], each["name"], each["old"], each["new"]) for each in found]
     assert lines == [(1, "A", 1, 2), (1, "B", 1, 2), (154, "C", 1, 2)]
     first = time_text(HOUR_AGO + 600)
-    assert command("history", "1", "A").words == [
-        ["time", "component", "name", "old", "new", "by"],
-        [first, "1", "A", "1", "2", "us"],
-    ]
+    header = ["time", "component", "name", "old", "new", "by"]
+    assert command("history", "1", "A").words == [header, [first, "1", "A", "1", "2", "us"]]
     second = time_text(HOUR_AGO + 900)
     assert command("history", "1", "--since", "0s ago").err == "no changes are in the cache\n"
     since = command("history", "1/1", "--since", second, "--json").json["history"]

@@ -85,6 +85,5 @@ def test_times_are_local_with_their_zone_and_can_be_parsed_back(command: Command
     assert re.fullmatch(local, command("cache", "list").rows[1][4])
     [line] = command("history", 1, "--json").json["history"]
     assert line["time"].endswith("Z")
-    assert parse_time(line["time"], time.time() + 1000) == pytest.approx(
-        parse_time(history.rows[1][0], time.time() + 1000)
-    )
+    times = [parse_time(text, time.time() + 1000) for text in (line["time"], history.rows[1][0])]
+    assert times[0] == pytest.approx(times[1])

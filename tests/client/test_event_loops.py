@@ -196,7 +196,6 @@ def test_a_client_of_a_program_that_leaves_it_open_and_of_a_repl(loop: str, way:
     done = subprocess.run(
         [sys.executable, *words], env=environment, input=typed, capture_output=True, text=True, timeout=60
     )
-    assert (done.returncode, "7.25" in done.stdout, "Traceback" in done.stderr) == (0, True, False), (
-        done.stderr
-    )
+    outcome = (done.returncode, "7.25" in done.stdout, "Traceback" in done.stderr)
+    assert outcome == (0, True, False), done.stderr
     assert table_in(tmp_path / "paramclient/parameters.sqlite3").params["MC_ROLL_P"].value == 7.25

@@ -187,10 +187,8 @@ def test_an_impossible_include_is_reported_with_its_line(line: str, problem: str
 def test_an_error_in_an_included_file_names_both_lines(tmp_path: Path) -> None:
     first = tree(tmp_path, a_parm="A 1\n@include b.parm\n", b_parm="B 1\nbad\n")
     error = refused(lambda: read_file(first))
-    assert str(error).splitlines() == [
-        f"{tmp_path}/b.parm:2: expected NAME VALUE, found 'bad'",
-        f"{first}:2: includes that file",
-    ]
+    bad = f"{tmp_path}/b.parm:2: expected NAME VALUE, found 'bad'"
+    assert str(error).splitlines() == [bad, f"{first}:2: includes that file"]
     assert (error.source, error.line) == (f"{tmp_path}/b.parm", 2)
     (tmp_path / "b.parm").write_bytes(b"B 1\n\xff\n")
     assert "includes that file" in str(refused(lambda: read_file(first)))

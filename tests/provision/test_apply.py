@@ -517,9 +517,8 @@ async def test_the_actual_value_is_what_the_vehicle_sent_last() -> None:
     async with a_client(vehicle) as client:
         component = await client.component()
         result = await apply(component, {"TUNE_01": 99.0, "TUNE_02": 4.5}, progress=change)
-        assert {name: row.actual for name, row in result.rows.items()} == {
-            name: component.params[name].value for name in result.rows
-        }
+        actual = {name: row.actual for name, row in result.rows.items()}
+        assert actual == {name: component.params[name].value for name in result.rows}
         assert (await plan(component, ParamSet({"TUNE_01": 10}))).complete
 
 
