@@ -476,7 +476,8 @@ async def _seek_evidence(session: Session) -> None:
     channel, table, began = session.channel, session.table, anyio.current_time()
     known = [each for each in table.params.values() if each.type.is_integer and each.value]
     if session.serves_reads.get(int) is not False:
-        ways = [way for each in known for way in (each.name, each.index) if way is not None][:EVIDENCE_READS]
+        ways = [way for each in known for way in (each.name, each.index) if way is not None]
+        ways = (ways * EVIDENCE_READS)[:EVIDENCE_READS]  # each several times, where they are few
         ways += range(min(EVIDENCE_MAX, table.count or EVIDENCE_MAX))
         with channel.inbox(session.dialect.value) as inbox:
             for first in range(0, len(ways), EVIDENCE_READS):

@@ -350,7 +350,7 @@ class KeptTable(Stream[Change]):
         while True:
             await anyio.sleep(PROGRESS_INTERVAL)
             self._send_known()
-            if anyio.current_time() >= late_at and not all(self._listing.values()):
+            if anyio.current_time() >= late_at and self._listing and not listed(self.session):
                 late_at += FIRST_VALUE_TIME
                 channel.send(self.session.dialect.request_read(channel.reads_from, 0))
 

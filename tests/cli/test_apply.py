@@ -85,7 +85,7 @@ def test_apply_sets_and_verifies_values_that_differ(command: Command, put: Put, 
 
 
 IMPOSSIBLE = {
-    "quad.param": "RTL_ALT,2500\nSIM GPS,0\n",
+    "quad.param": "RTL_ALT,2500\nSIM_GPS1.BYTELOSS,0\n",
     "{system}.param": "RTL_ALT,2500\nWPNAV_SPEED,fast\n",
     "quad.params": "1\t1\tRTL_ALT\t2500\t6\n1\t1\tWPNAV_SPEED\t1e39\t9\n",
 }
