@@ -201,6 +201,7 @@ class _Download:
         if is_silent or not serves_reads:
             first = min(self._received, default=0)
             self.result.has_gap = any(has_loss or first < each < self._reached for each in missing)
+        # what lies behind the highest index was only counted
         self.result.lost = len(self._lost & {*self._received, *missing} & {*range(self._reached + 1)})
 
     async def _take_passes(self) -> None:
