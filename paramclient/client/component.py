@@ -635,9 +635,9 @@ class Component:
             words = node_in_words(self.node)
             what = f"two vehicles use the ids {words}; nothing was written."
             raise AmbiguousVehicle(what, vehicles=[words], choose_by="peer")
-        others = [each for each in self.core.station.nodes.values() if each.system == self.system]
-        if self.component == 0 and len(others) > 1:
-            raise UsageError(f"component 0 means all {len(others)} of its system; nothing was written")
+        reached = [each for each in self.core.station.nodes.values() if each.system == self.system]
+        if self.component == 0 and len(reached) > 1:
+            raise UsageError(f"component 0 means all {len(reached)} of its system; nothing was written")
         if durable:
             with anyio.move_on_after(0.0 if self.core.cache is None else CACHE_TIMEOUT):
                 await self.cache_is_read.wait()

@@ -35,7 +35,7 @@ from paramclient.files.reading import (
     value_text,
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
-from paramclient.model.values import ParamType, Value, check_portable_name, is_portable_name
+from paramclient.model.values import NAME_LENGTH, ParamType, Value, check_portable_name, is_portable_name
 
 FILES_MAX: Final = 64
 """Files that one file may include in total, nested or not. Two lines in each of a few files could include
@@ -279,7 +279,7 @@ def _has_name(reading: Reading, line: TextLine, name: str, expected: str, source
         check_portable_name(name)
     except UsageError as error:
         reading.bad_line(line, f"{expected} ({error})", source)
-        reading.overlong_count += bool(re.fullmatch(r"[A-Z0-9_]{17,}", name))
+        reading.overlong_count += len(name) > NAME_LENGTH and bool(re.fullmatch("[A-Z0-9_]+", name))
         return False
     return True
 

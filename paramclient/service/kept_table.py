@@ -349,13 +349,15 @@ class KeptTable(Stream[Change]):
         channel, late_at = self.session.channel, anyio.current_time() + FIRST_VALUE_TIME
         while True:
             await anyio.sleep(PROGRESS_INTERVAL)
-            self._send_known()
-            if anyio.current_time() >= late_at and self._listing and not listed(self.session):
+            if not self._send_known() and self._listing and anyio.current_time() >= late_at:
                 late_at += FIRST_VALUE_TIME
                 channel.send(self.session.dialect.request_read(channel.reads_from, 0))
 
-    def _send_known(self) -> None:
-        """Send the values of the list that the stations do not have; another count begins it again."""
+    def _send_known(self) -> bool:
+        """Send the values of the list that the stations do not have; another count begins it again.
+
+        Return whether any value is known, for stations that wait.
+        """
         if self._listing_count != self.session.table.count:
             self._listing_count = self.session.table.count
             for sent in self._listing.values():
@@ -363,6 +365,7 @@ class KeptTable(Stream[Change]):
         values = (self.list_if_current or listed(self.session)) if self._listing else []
         for station, sent in self._listing.items():
             self._stream(station, [value for value in values if value.param_index not in sent], sent)
+        return bool(values)
 
     # single values
 
