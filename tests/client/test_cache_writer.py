@@ -580,6 +580,5 @@ async def test_a_camera_is_cached_with_its_vehicle(tmp_path: Path, is_first: boo
         [vehicle] = cache.vehicles()
         assert vehicle.key == client.components[1, 1].identity.key
         assert 100 in vehicle.components
-        found_lines = cache.history("1", extended=True)
-    changes = [(each.name, each.new and each.new.value) for each in found_lines]
-    assert changes == [("CAM_ISO", 200), ("CAM_ISO", 400)]
+        lines = [(each.name, each.new and each.new.value) for each in cache.history("1", extended=True)]
+    assert lines == [("CAM_ISO", 200), ("CAM_ISO", 400)]

@@ -66,15 +66,15 @@ PARTS_WITHOUT_SETS = ["list", "list+names", "list+acks", "list+indices", "indice
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.15, 0.3])
-@pytest.mark.parametrize("is_fetched", [False, True])
+@pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.AUTO])
 @pytest.mark.parametrize("parts", [*PARTS_WITHOUT_SETS, "list+indices+acks", "indices+acks"])
 async def test_a_set_that_changes_nothing_is_told_as_that_within_a_dozen(
-    parts: str, delay: float, is_fetched: bool
+    parts: str, delay: float, policy: Policy
 ) -> None:
     vehicle = Partial(serves=parts.split("+"))
     async with talking(Air.symmetric([vehicle], delay=delay)) as (_, session):
         with suppress(errors.NoReply):
-            await fetch_all(session, policy=Policy.AUTO if is_fetched else Policy.CACHE_ONLY)
+            await fetch_all(session, policy=policy)
         with pytest.raises(errors.ValueNotApplied, match="1/1 keeps MODE at 5") as caught:
             with anyio.fail_after(15.0):
                 await write(session, "MODE", 4)

@@ -230,8 +230,9 @@ def test_a_full_queue_drops() -> None:
 
 def test_the_same_seed_gives_the_same_faults() -> None:
     def once(seed: int) -> list[tuple[float, int]]:
-        link = FaultyLink(loss=0.1, jitter=0.01, reorder=0.1, bit_errors=0.001, rate=1e5, seed=seed)
-        link.duplicate = 0.1
+        link = FaultyLink(
+            loss=0.1, jitter=0.01, duplicate=0.1, reorder=0.1, bit_errors=0.001, rate=1e5, seed=seed
+        )
         return pass_through(link, 500)
 
     assert once(1) == once(1) != once(2)
